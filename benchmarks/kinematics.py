@@ -59,13 +59,13 @@ class Contender:
 
 def kernel_contender(urdf: Urdf, joint_pos: np.ndarray, device: str) -> Contender:
     """Our kernel at configurations [n j] float32 rad."""
-    batched = BatchedKinematics.of_urdf(urdf, device)
+    batched = BatchedKinematics(urdf, device)
     rows = wp.array(joint_pos, device=device)
     out = batched.poses(rows)
 
     def poses() -> Poses:
         found = out.numpy()[:COMPARED]
-        return {link: split_poses(found[:, number]) for number, (_, link) in enumerate(batched.links[0])}
+        return {link: split_poses(found[:, number]) for number, link in enumerate(batched.links)}
 
     return Contender("xew kernel", lambda: batched.poses(rows, out=out), poses)
 

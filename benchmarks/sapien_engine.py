@@ -32,8 +32,8 @@ import warp as wp
 from xew.sim_warp import stage
 from xew.sim_warp.geometry.camera import HEAD_CAMERA
 from xew.sim_warp.geometry.meshes import Mesh
-from xew.sim_warp.kinematics import joint_positions
 from xew.sim_warp.kinematics.expert import joint_commands
+from xew.sim_warp.kinematics.forward import joint_positions
 from xew.sim_warp.physics import Motion, simulate
 from xew.sim_warp.physics.template import PAD_FRICTION
 from xew.sim_warp.physics.worlds import STEPS_PER_FRAME, TIME_STEP, World

@@ -84,7 +84,7 @@ def compile_for(variants: Iterable[Variant], arch: int) -> int:
     """Compile modules into Warp's cache for GPUs of an architecture, on as many threads as there are cores.
 
     No such GPU needs to be here: the compiler comes with Warp. A module's file is found there by its name, which says what is
-    in it, so that the cache can be copied to where the GPU is.
+    in it. Copy the cache to the machine with the GPU.
 
     Args:
         variants: what to compile.

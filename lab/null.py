@@ -91,7 +91,7 @@ class Args:
 
 
 class NullStudy(StudyGrades):
-    """A study of equal variants whose scores are drawn anew for every study, without a table on disk.
+    """A study of equal variants with newly drawn scores for every study, without a table on disk.
 
     Args:
         null: what is drawn.

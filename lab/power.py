@@ -98,7 +98,7 @@ def _table(power: pd.DataFrame) -> str:
 
 
 def write_section(path: Path, heading: str, text: str) -> None:
-    """Write one section of a Markdown page anew; all else on the page stays, and a page that is not there begins with it.
+    """Write one section of a Markdown page again, without changing the rest; a missing page is created.
 
     Args:
         path: of the page.

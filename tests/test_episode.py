@@ -115,7 +115,7 @@ def edit(folder: Path, **changes: object) -> None:
 
 def test_another_schema_version_is_refused(folder: Path) -> None:
     edit(folder, schema_version=SCHEMA_VERSION + 1)
-    with pytest.raises(EpisodeError, match=f"schema version {SCHEMA_VERSION + 1}, this xew reads {SCHEMA_VERSION}; generate"):
+    with pytest.raises(EpisodeError, match=f"schema version {SCHEMA_VERSION + 1}, expected {SCHEMA_VERSION}; generate"):
         read_record(folder)
 
 
@@ -170,7 +170,7 @@ def test_a_part_of_a_data_set_is_told_from_an_empty_folder(inside: str, tmp_path
     write_episode(tmp_path, Record("grab_roller", 3, "piper", False, "grasp"))
     with pytest.raises(EpisodeError) as error:
         find_accepted(tmp_path / inside)
-    assert str(error.value) == f"{tmp_path / inside} lies inside of a data set; name the whole of it: {tmp_path}."
+    assert str(error.value) == f"{tmp_path / inside} lies inside a data set; pass the data set's root: {tmp_path}."
 
 
 def cells(data: Path, seed: int, **successes: bool | None) -> None:

@@ -1,6 +1,6 @@
 """xew: can an action-conditioned world model render a robot that it has never seen?
 
-Rooms, in the order in which the data flows (docs/architecture.md):
+Packages, in the order in which the data flows (docs/architecture.md):
     sim_warp   (task, seed)         -> episodes      paired data, Newton and Warp
     model      episodes             -> rollouts      video-diffusion world model, JAX
     metrics    prediction, target   -> scores        jitted functions, JAX

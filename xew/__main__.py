@@ -1,6 +1,6 @@
-"""The front door: `python -m xew` lists all commands (COMMANDS), and `xew train CONFIG` is `python -m xew.model.train CONFIG`.
+"""The entry point: `python -m xew` lists all commands (COMMANDS), and `xew train CONFIG` is `python -m xew.model.train CONFIG`.
 
-`xew` is the same as `python -m xew`. To add a command: one line in COMMANDS, in the order of the pipeline.
+`xew` is the same as `python -m xew`. To add a command, add one line to COMMANDS, in the order of the pipeline.
 """
 
 import runpy
@@ -25,7 +25,7 @@ COMMANDS = {
     "report": ("xew.analysis.report", "make a report page of scores"),
     "study": ("xew.analysis.study", "run a whole study: data, runs, scores and report"),
     "study-analyse": ("xew.analysis.study_analyse", "merge a study's scores and make its report"),
-    "distance": ("xew.analysis.distance", "measure how far robots are from one another"),
+    "distance": ("xew.analysis.distance", "measure the distances between robots"),
 }
 """Module and purpose of each command."""
 

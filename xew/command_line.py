@@ -1,6 +1,6 @@
-"""Commands on a config: `CONFIG [flags] [--section.field value …]`, where --help lists all that may be overridden.
+"""Commands on a config: `CONFIG [flags] [--section.field value …]`; --help lists every option.
 
-The flags are a dataclass of the command; every other option is a field of the config and has the config's value as default.
+The flags are a dataclass of the command. Every other option is a field of the config, with the config's value as its default.
 """
 
 import dataclasses
@@ -18,13 +18,13 @@ C = TypeVar("C")
 
 
 class Command(NamedTuple, Generic[F, C]):
-    """What a command line asks for."""
+    """A parsed command line."""
 
     path: Path
-    """The config, or what else the command works on."""
+    """Path of the config, or of another input of the command."""
     flags: F
     config: C
-    """The content of the config with the overrides in it; only types have been checked, and that numbers are finite."""
+    """The config with its overrides; only types and the finiteness of numbers have been checked."""
 
 
 def parse_command(
@@ -40,26 +40,26 @@ def parse_command(
     """Parse a command line.
 
     Args:
-        flags: the command's own flags, a dataclass whose fields all have defaults. They go before fields of the config that
-            have the same name.
-        kind: type of the config, a dataclass; its fields may be overridden.
+        flags: the command's own flags, a dataclass whose fields all have defaults. They override fields of the config with
+            the same name.
+        kind: type of the config, a dataclass.
         read: reads the config at a path.
-        arguments: those of the process where left out.
-        prog: how the command is called, for messages.
+        arguments: default: the arguments of the process.
+        prog: name of the command, for messages.
         description: one line on what it does.
         metavar: name of the first argument, for messages.
 
     Raises:
-        ConfigError: the config is not named, or cannot be read, or a number is not finite.
-        SystemExit: an option is unknown or malformed (tyro has told so; code 2), or asks for --help (code 0).
+        ConfigError: the config is missing or cannot be read, or a number is not finite.
+        SystemExit: an option is unknown or malformed (code 2), or --help was given (code 0).
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
     path = find_path(words, flags)
     if path is None and not {"-h", "--help"} & set(words):
-        raise ConfigError(f"name the {metavar} first, as in `{prog} {metavar}`; --help tells the rest.")
+        raise ConfigError(f"name the {metavar} first, as in `{prog} {metavar}`; --help lists all options.")
     first = ("path", Annotated[Path, tyro.conf.Positional, tyro.conf.arg(name=metavar.lower(), help=f"The {metavar}.")])
     own = [field.name for field in dataclasses.fields(flags)]  # type: ignore[arg-type]
-    # A flag gives a default to a field of the config that has its name; fields without one may then follow as keywords only.
+    # Fields without a default may follow fields that have one as keywords only.
     required = [
         (field.name, field.type)
         for field in dataclasses.fields(kind)  # type: ignore[arg-type]
@@ -73,15 +73,15 @@ def parse_command(
         values = {name: getattr(flags(), name) for name in own} | {name: getattr(config, name) for name in others}
         default = whole(path=path, **values)
     style = (tyro.conf.FlagCreatePairsOff,)
-    found = tyro.cli(whole, args=words, default=default, prog=prog, description=description, config=style)
-    assert config is not None  # without a path --help was asked for, which has ended the program
-    changed: Any = dataclasses.replace(config, **{name: getattr(found, name) for name in others})  # type: ignore[type-var]
+    options = tyro.cli(whole, args=words, default=default, prog=prog, description=description, config=style)
+    assert config is not None  # without a path, --help has ended the program
+    changed: Any = dataclasses.replace(config, **{name: getattr(options, name) for name in others})  # type: ignore[type-var]
     check_finite(changed, str(path))
-    return Command(found.path, flags(**{name: getattr(found, name) for name in own}), changed)
+    return Command(options.path, flags(**{name: getattr(options, name) for name in own}), changed)
 
 
 def find_path(words: Sequence[str], flags: type) -> Path | None:
-    """The first of a command's arguments that is no option and no option's value."""
+    """The first argument that is neither an option nor an option's value."""
     switches = {"--" + field.name.replace("_", "-") for field in dataclasses.fields(flags) if field.default is False}
     is_value = False
     for word in words:

@@ -1,18 +1,17 @@
-"""What processes share of JAX: compiled programs and a GPU's memory. JAX is imported only where this is asked for."""
+"""JAX settings that processes share: the cache of compiled programs and the allocation of GPU memory."""
 
 import os
 
 from xew.files import cache_folder
 
 LEAST = "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"
-"""Environment variable by which a user says from which compiling time on JAX keeps a program."""
+"""Environment variable for the least compile time at which JAX caches a program."""
 
 
 def keep_compiled_programs() -> None:
-    """Keep compiled programs between runs in the user's cache folder, unless JAX was told otherwise.
+    """Cache compiled programs of all sizes in the user's cache folder, unless the user has configured JAX otherwise.
 
-    All of them: JAX itself keeps those that compile for a second and more, and a process that grades has eight shorter ones,
-    which take it 2.5 s on a CPU.
+    By default JAX caches programs that compile for one second or more. Grading has eight shorter ones: 2.5 s on a CPU.
     """
     import jax
 
@@ -22,15 +21,9 @@ def keep_compiled_programs() -> None:
             jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 
-ALLOCATOR = "XLA_PYTHON_CLIENT_ALLOCATOR"
-"""Environment variable by which JAX is told how to take a GPU's memory."""
-GIVING_BACK = "platform"
-"""Value of ALLOCATOR with which JAX gives memory back after each use, for others on the same GPU; it takes longer."""
-
-
 def take_memory_as_needed() -> None:
-    """Have JAX take a GPU's memory as it needs it and not three quarters at once, unless it was told otherwise.
+    """Make JAX allocate GPU memory on demand instead of three quarters at once, unless the user has configured it otherwise.
 
-    It is for commands that share a GPU with Warp or with processes of their own, before JAX's first computation.
+    Call it before JAX's first computation, in commands that share a GPU with Warp or with worker processes.
     """
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")

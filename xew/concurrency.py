@@ -17,12 +17,12 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 PARSING = threading.RLock()
-"""Lock for whatever threads do that parses Python: reading .npy headers, building kernels. Python 3.11 counts the depth of all
-parsers in one place (github.com/python/cpython/issues/106905), and two at a time end in a SystemError now and then."""
+"""Lock for everything that parses Python in a thread: reading .npy headers, building kernels. In Python 3.11 two parsers at a
+time can raise SystemError (github.com/python/cpython/issues/106905)."""
 
 
 def usable_cores() -> int:
-    """Number of processor cores that this process may use: a job of a cluster has fewer than its machine."""
+    """Number of processor cores that this process may use; a cluster job may have fewer than its machine."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
@@ -38,13 +38,13 @@ def visible_gpus() -> tuple[str, ...]:
 
 
 def free_gpu_memory(gpus: Sequence[str]) -> tuple[float, ...]:
-    """How much memory is free on each of some GPUs [GB], as NVIDIA's tool tells it; nothing where it does not."""
+    """Free memory of each GPU [GB], by nvidia-smi; an empty tuple if nvidia-smi fails."""
     if not gpus:
         return ()
     query = ("nvidia-smi", "--query-gpu=memory.free", "--format=csv,noheader,nounits", "-i", ",".join(gpus))
     try:
-        told = subprocess.run(query, capture_output=True, text=True, check=True).stdout.split()
-        return tuple(float(mebibytes) * 2**20 / 1e9 for mebibytes in told)
+        output = subprocess.run(query, capture_output=True, text=True, check=True).stdout
+        return tuple(float(mebibytes) * 2**20 / 1e9 for mebibytes in output.split())
     except (OSError, subprocess.CalledProcessError, ValueError):
         return ()
 
@@ -57,11 +57,10 @@ def map_in_order(
 ) -> Iterator[Result]:
     """Results of a function over items, in their order, computed by threads that are at most a few items ahead.
 
-    Where one raises, or whoever takes the results stops, nothing more is begun, and `stop` is set, so that what is under way
-    can end early.
+    If a call raises or the consumer stops, no further call begins, and `stop` is set for running calls to end early.
 
     Args:
-        workers: threads; as many as there are cores where left out.
+        workers: number of threads; default: the number of cores.
     """
     workers = workers or usable_cores()
     with ThreadPoolExecutor(workers) as pool:
@@ -86,17 +85,17 @@ def open_processes(
     arguments: tuple[Any, ...] = (),
     own: Sequence[Any] = (),
 ) -> ProcessPoolExecutor:
-    """Processes that ignore Ctrl-C, for the one that started them decides, and that leave with it.
+    """Worker processes that ignore Ctrl-C and exit when their parent exits.
 
-    They are forked from one that has imported what they need (multiprocessing's forkserver): each starts in milliseconds
-    instead of importing for seconds, and they share the memory of what was imported.
+    They are forked from a process that has imported their modules (multiprocessing's forkserver), start in milliseconds, and
+    share the memory of these modules.
 
     Args:
-        count: their number; each is started when it is first needed.
-        imported: modules to import before forking, where this process has started none yet. None of them may start a thread,
-            JAX's backend, Warp or CUDA at import, which no fork survives.
+        count: number of processes; each starts when it is first needed.
+        imported: modules to import before the first fork. None of them may start a thread, JAX's backend, Warp or CUDA at
+            import.
         begin: called with `arguments` in each process before its first task.
-        own: what processes have for themselves, in turn, such as a GPU; `begin` has it as its last argument.
+        own: resources that processes get in turn, such as GPUs; the last argument of `begin`.
     """
     multiprocessing.set_forkserver_preload(list(imported))
     context = multiprocessing.get_context("forkserver")
@@ -111,7 +110,7 @@ def open_processes(
 def _begin_process(
     environment: dict[str, str], begin: Callable[..., object], arguments: tuple[Any, ...], turns: "SimpleQueue[Any] | None"
 ) -> None:
-    os.environ.update(environment)  # as it is now: the process that forks was started with that of an earlier time
+    os.environ.update(environment)  # the forking process may have been started with an earlier environment
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     leave_with_parent(lambda: os._exit(1))
     begin(*arguments, *(() if turns is None else (turns.get(),)))
@@ -124,17 +123,14 @@ def map_in_processes(
     imported: Sequence[str] = (),
     gpus: Sequence[str] = (),
 ) -> Iterator[Result]:
-    """Results of a function over items, in their order, computed by other processes.
-
-    With the last result the processes leave, while this one goes on.
+    """Results of a function over items, in their order, computed by worker processes that exit after the last result.
 
     Args:
-        opener: gives the function; called early in each process, and again by its first item where it has raised, so that the
-            item gets what it raises.
-        items: sent to the processes, as results and exceptions are sent back: all of them can be pickled.
-        processes: their number; no more are started than there are items.
+        opener: returns the function; called early in each process. If it raises, the first item calls it again and raises.
+        items: items; they, the results and exceptions must support pickle.
+        processes: largest number of processes.
         imported: modules that the processes need; see `open_processes`.
-        gpus: of which each process sees one, in turn, as CUDA_VISIBLE_DEVICES names them; where left out all see all.
+        gpus: GPUs as CUDA_VISIBLE_DEVICES names them, one for each process in turn; default: every process sees all.
     """
     count = min(processes, len(items))
     pool = open_processes(count, imported, _open_function, (opener,), gpus)
@@ -147,7 +143,7 @@ def map_in_processes(
 
 
 _opened: list[Callable[[], Any]] = []
-"""Function of this process, once `_open_function` has been called; it is made when it is first asked for."""
+"""Cached opener of this process, set by `_open_function`."""
 
 
 def _open_function(opener: Callable[[], Callable[[Any], Any]], gpu: str | None = None) -> None:
@@ -157,8 +153,7 @@ def _open_function(opener: Callable[[], Callable[[Any], Any]], gpu: str | None =
 
 
 def _open_early() -> None:
-    """Open this process' function; who asks for it next gets what that raises, since nobody reads the result of this call."""
-    _opened[0]()
+    _opened[0]()  # an error is raised again by the first item
 
 
 def _call_function(item: Any) -> Any:
@@ -166,10 +161,7 @@ def _call_function(item: Any) -> Any:
 
 
 def leave_with_parent(leave: Callable[[], object]) -> None:
-    """Have this process leave when the process that started it has ended, so that none works on unwatched.
-
-    A thread of this process calls `leave`. Nothing happens in a process that multiprocessing did not start.
-    """
+    """Call `leave` in a thread when the process that started this one has ended; does nothing in a main process."""
     parent = multiprocessing.parent_process()
     if parent is None:
         return

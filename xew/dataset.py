@@ -1,7 +1,6 @@
-"""Data sets: the index of a folder of episodes, read once a process and refreshed where the folder has changed.
+"""Data sets: the index of a folder of episodes, read once per process and refreshed when the folder has changed.
 
-A data set of the paper's size has 8,750 headers. `read_dataset` lists the folder each time, but opens only headers that are
-new or whose file has changed since this process read them last.
+`read_dataset` lists the folder each time, but opens only headers that are new or have changed since the last read.
 """
 
 import os
@@ -21,7 +20,7 @@ Signature = tuple[int, int, int, int]
 """Inode, size, time of change and of status change [ns] of a header's file."""
 
 UNSETTLED_NS = 100_000_000
-"""Age [ns] under which a header is read again next time: two writes within one tick of a file system's clock look alike."""
+"""Age [ns] below which a header is read again next time: two writes within one clock tick have equal time stamps."""
 
 _READ: dict[Path, dict[Path, tuple[Signature, Record]]] = {}
 """Headers that this process has read, by the data set's absolute path and the episode's folder in it."""
@@ -37,11 +36,8 @@ class Dataset:
 
     @cached_property
     def accepted(self) -> tuple[Episode, ...]:
-        """Episodes of seeds in which every robot tried has succeeded: the paired data set.
-
-        Raises EpisodeError if there is none, and says what to do.
-        """
-        # Where somebody failed the others have no pictures, also if the run was stopped before it wrote who had failed.
+        """Episodes of seeds on which every tried robot succeeded: the paired data set. Raises EpisodeError if there is none."""
+        # After a failure the other robots have no videos, even if the run stopped before it wrote the failed cell.
         failed = {(record.task, record.seed) for _, record in self.cells if not record.success or not record.hashes}
         accepted = tuple((folder, record) for folder, record in self.cells if (record.task, record.seed) not in failed)
         if not accepted:
@@ -61,13 +57,13 @@ class Dataset:
         split: str | None = None,
         motion: str | None = None,
     ) -> list[Episode]:
-        """Accepted episodes of these robots, tasks and seed family, each of which may be left open; possibly none.
+        """Accepted episodes of these robots, tasks and seed family; None selects all. The list may be empty.
 
         Args:
-            motion: kind of motion that they have to be of (`Split.motion`); left open, any.
+            motion: required kind of motion (`Split.motion`); None accepts any.
 
         Raises:
-            EpisodeError: the data set has no accepted episode at all, or some of those chosen are of another kind of motion.
+            EpisodeError: the data set has no accepted episode, or a selected one has another kind of motion.
         """
         chosen = [
             (folder, record)
@@ -89,19 +85,20 @@ def read_dataset(data: Path, problems: list[str] | None = None) -> Dataset:
         problems: list to which one message is added for each damaged header, which is then left out.
 
     Raises:
-        EpisodeError: a header is damaged, and no list of problems was given.
+        EpisodeError: a header is damaged and `problems` is None.
     """
     root = Path(data).absolute()
     before = _READ.get(root, {})
-    found: dict[Path, tuple[Signature, Record]] = {}
+    headers: dict[Path, tuple[Signature, Record]] = {}
     cells: list[Episode] = []
-    for folder in find_folders(data):
+    folders = (path.parent for path in Path(data).glob("*/*/*/episode.json"))
+    for folder in sorted(folder for folder in folders if not folder.name.startswith(TEMPORARY)):
         name = folder.relative_to(data)
         try:
             signature, known = _sign(folder), before.get(name)
             record = known[1] if known is not None and known[0] == signature else read_record(folder)
         except FileNotFoundError:
-            continue  # a cell that goes while they are read, because it is being replaced
+            continue  # the cell is being replaced
         except EpisodeError as error:
             if isinstance(error.__cause__, FileNotFoundError):
                 continue
@@ -111,8 +108,8 @@ def read_dataset(data: Path, problems: list[str] | None = None) -> Dataset:
             continue
         cells.append((folder, record))
         if time.time_ns() - signature[3] > UNSETTLED_NS:
-            found[name] = signature, record
-    _READ[root] = found
+            headers[name] = signature, record
+    _READ[root] = headers
     return Dataset(Path(data), tuple(cells))
 
 
@@ -121,45 +118,36 @@ def _sign(folder: Path) -> Signature:
     return status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
 
 
-def find_folders(data: Path) -> list[Path]:
-    """Folders of all cells of a data set, sorted by task, seed, robot."""
-    folders = (path.parent for path in Path(data).glob("*/*/*/episode.json"))
-    return sorted(folder for folder in folders if not folder.name.startswith(TEMPORARY))
-
-
 def find_records(data: Path) -> Iterator[Episode]:
     """All cells of a data set with their headers, accepted or not. Raises EpisodeError at a damaged header."""
     return iter(read_dataset(data).cells)
 
 
 def find_accepted(data: Path) -> list[Episode]:
-    """Episodes of seeds in which every robot tried has succeeded: the paired data set.
-
-    Raises EpisodeError if there is none, and says what to do.
-    """
+    """`Dataset.accepted` of a data set."""
     return list(read_dataset(data).accepted)
 
 
 def demand_motion(data: Path, records: Iterable[Record], motion: str) -> None:
-    """Raise EpisodeError where episodes of a data set are not of the kind of motion that a split names (`Split.motion`)."""
-    found = count_motions(records)
-    if set(found) - {motion}:
+    """Raise EpisodeError if an episode has another kind of motion than `Split.motion`."""
+    counts = count_motions(records)
+    if set(counts) - {motion}:
         raise EpisodeError(
-            f"{data} has {_list_motions(found)} to be read, and the split is of {motion} motion; choose a split of the other"
-            " kind (--split fixed, fixed_own)."
+            f"{data} has {_list_motions(counts)}, and the split is of {motion} motion; choose a split of the other kind "
+            "(--split fixed, fixed_own)."
         )
 
 
 def demand_one_motion(data: Path, records: Iterable[Record]) -> str:
     """The kind of motion of a data set's episodes, one of `MOTIONS`. Raises EpisodeError if they have both."""
-    found = count_motions(records)
-    if len(found) > 1:
-        raise EpisodeError(f"{data} has {_list_motions(found)}, which do not compare; keep them in data sets of their own.")
-    return next(iter(found), MOTIONS[0])
+    counts = count_motions(records)
+    if len(counts) > 1:
+        raise EpisodeError(f"{data} has {_list_motions(counts)}, which cannot be compared; keep them in separate data sets.")
+    return next(iter(counts), MOTIONS[0])
 
 
 def count_motions(records: Iterable[Record]) -> dict[str, int]:
-    """Numbers of episodes by kind of motion, in the order of `MOTIONS`; kinds of which there are none are left out."""
+    """Numbers of episodes by kind of motion, in the order of `MOTIONS`, without kinds that have none."""
     counts = Counter(record.motion for record in records)
     return {motion: counts[motion] for motion in MOTIONS if counts[motion]}
 
@@ -169,9 +157,9 @@ def _list_motions(counts: dict[str, int]) -> str:
 
 
 def explain_missing(data: Path, what: str = "episode") -> EpisodeError:
-    """The error for a folder without episodes: it says how to make some or, inside of a data set, names the data set."""
+    """The error for a folder without episodes; for a folder inside a data set it names the data set."""
     for levels, pattern in enumerate(("*/*/episode.json", "*/episode.json", "episode.json")):
         if next(Path(data).glob(pattern), None):
             root = Path(data).absolute().parents[levels]
-            return EpisodeError(f"{data} lies inside of a data set; name the whole of it: {root}.")
+            return EpisodeError(f"{data} lies inside a data set; pass the data set's root: {root}.")
     return EpisodeError(f"no {what} under {data}; make some: python -m xew.sim_warp.generate --out {data}")

@@ -1,11 +1,11 @@
-"""The contract between rooms: what an episode holds, and how it is written, read and verified (`xew.dataset` finds them).
+"""The contract between packages: what an episode holds, and how it is written, read and verified.
 
 An episode is a folder `<data>/<task>/<seed>/<robot>/`:
     episode.json   who, how long, success or the reason of failure, versions, hashes (always there)
     states.npz     the arrays of `States` (accepted episodes only)
     rgb.mkv        the head camera, lossless (H.264 in RGB, Matroska)
     robot.mkv      the robot alone, posed by the commanded joints, on a white ground, lossless
-Folders appear under their final name only when complete. A rejected cell keeps its episode.json and nothing else.
+Folders appear under their final name only when complete. A rejected cell has only its episode.json.
 
 Shape letters, here and everywhere: t frames, h w c image, j joints, a action, o objects, k keypoints, n worlds, b batch.
 Quaternions are x y z w; the world frame has its origin under the table's center, x right, y away from the robot, z up.
@@ -39,21 +39,21 @@ from xew.protocol import MOTIONS, SHARED_MOTION
 SCHEMA_VERSION = 2
 WIDTH, HEIGHT = 320, 240
 FAILURES = ("plan", "grasp", "slip", "timeout", "physics", "overflow")
-"""plan: no joint path. grasp: never held. slip: held and lost. timeout: the plan ended short of success.
-physics: an object sank into something, fell off the table or crept in a hand. overflow: a physics buffer was too small."""
+"""plan: no joint path. grasp: never held. slip: held and lost. timeout: the plan ended without success.
+physics: an object sank into something, fell off the table or slid in a hand. overflow: a physics buffer was too small."""
 HELD = ("episode.json", "states.npz", "rgb.mkv", "robot.mkv")
-"""Names of the files of an episode. A folder that holds anything else is never replaced by one."""
+"""Names of the files of an episode. A folder with any other file is never replaced."""
 SEED_END = 2**63
 """End of the range of seeds; tables store them in 64 bits."""
 FORMATS = "matroska,webm,mov,mp4,m4a,3gp,3g2,mj2"
-"""Containers that are read, by FFmpeg's names. Others, such as playlists, name further files, which FFmpeg would open."""
+"""Containers that are read, by FFmpeg's names. Others, such as playlists, may make FFmpeg open further files."""
 TEMPORARY = ".writing-"
-"""Beginning of the name of a folder that is not complete yet."""
+"""Prefix of the name of an incomplete folder."""
 
 
 @dataclass(frozen=True)
 class States:
-    """Everything recorded of an episode: the truth of which all pixels are a view."""
+    """The recorded states of an episode; all pixels are rendered from them."""
 
     action: np.ndarray
     """[t 16] float32, commanded joint positions [rad] and grippers [0 closed, 1 open] in force at each frame."""
@@ -68,16 +68,16 @@ class States:
     object_joint: np.ndarray
     """[t o] float32, hinge angle [rad] of objects that have a hinge, else 0."""
     contact: np.ndarray
-    """[t 2 o] bool, does any finger of the left, right arm touch the object."""
+    """[t 2 o] bool, whether a finger of the left, right arm touches the object."""
     penetration: np.ndarray
-    """[t o] float32, how deep the object and anything else, a finger, the table or another object, are in each other [m]."""
+    """[t o] float32, deepest penetration between the object and a finger, the table or another object [m]."""
     keypoints: np.ndarray
     """[t k 2] float32, origins of the robot's links by forward kinematics of `joint_pos`, pixels (x right, y down,
     (0, 0) the center of the upper left pixel)."""
     keypoint_visible: np.ndarray
     """[t k] bool, in the image and not hidden by an object or by another link."""
     robot_mask: np.ndarray
-    """[t h w] bool, pixels in which the robot is what the head camera sees."""
+    """[t h w] bool, pixels in which the head camera sees the robot."""
     intrinsics: np.ndarray
     """[3 3] float64, the head camera's K [pixels]."""
     extrinsics: np.ndarray
@@ -99,7 +99,7 @@ class Record:
     failure: str | None = None
     """One of `FAILURES` where success is false."""
     failure_detail: str = ""
-    """The same in words."""
+    """The failure in words."""
     instruction: str = ""
     frame_count: int = 0
     frame_rate: float = 1000 / 60
@@ -108,25 +108,25 @@ class Record:
     scene_hash: str = ""
     """SHA-256 of the scene, which is the same for all robots."""
     hashes: dict[str, str] = field(default_factory=dict)
-    """SHA-256 of states, rgb and robot (decoded bytes, so that a container's padding does not count)."""
+    """SHA-256 of states, rgb and robot (decoded bytes, independent of the container)."""
     versions: dict[str, str] = field(default_factory=dict)
     device: str = ""
     source: str = ""
-    """Format that an episode was imported from, if it was not simulated here."""
+    """Format from which the episode was imported; empty for simulated episodes."""
     unknown: tuple[str, ...] = ()
-    """Arrays of `States` of which the source says nothing: their numbers are NaN, their truth values False."""
+    """Arrays of `States` that the source does not record: numbers are NaN, truth values False."""
     schema_version: int = SCHEMA_VERSION
     videos: bool = True
-    """Are rgb and robot stored? Where not, `python -m xew.sim_warp.inspect --render` makes them from the states."""
+    """Whether rgb and robot are stored. If not, `python -m xew.sim_warp.inspect --render` renders them."""
     motion: str = SHARED_MOTION
     """Kind of motion, one of `xew.protocol.MOTIONS`."""
 
 
 def episode_folder(data: Path, task: str, seed: int, robot: str) -> Path:
-    """The folder of an episode, or of what belongs to it in a tree of the same form.
+    """The folder of an episode in a data set or in a tree of the same form.
 
     Raises:
-        EpisodeError: a name or the seed could not be that of a folder (`xew.names.check_name`).
+        EpisodeError: a name or the seed is not valid for a folder (`xew.names.check_name`).
     """
     folder = Path(data).joinpath(*_folder_names(task, seed, robot))
     earlier = Path(data, task, f"{seed:07d}", robot)
@@ -134,7 +134,7 @@ def episode_folder(data: Path, task: str, seed: int, robot: str) -> Path:
 
 
 def place_episode(root: Path, task: str, seed: int, robot: str) -> Path:
-    """`episode_folder` for who writes there: links out of the tree are not followed but raise EpisodeError, too."""
+    """`episode_folder` for writing; a link that leads out of the tree raises EpisodeError, too."""
     return path_below(root, *_folder_names(task, seed, robot))
 
 
@@ -145,7 +145,7 @@ def _folder_names(task: str, seed: int, robot: str) -> tuple[str, str, str]:
 
 
 def data_folder(episode: Path) -> Path:
-    """The folder of the data set that the folder of an episode lies in."""
+    """The root of the data set of an episode's folder."""
     return episode.absolute().parents[2]
 
 
@@ -175,8 +175,8 @@ def write_episode(
     Args:
         data: root of the data set.
         record: the header; hashes are filled in here.
-        states, rgb [t h w 3] uint8, robot [t h w 3] uint8: what an accepted episode holds; leave out what is not stored.
-        videos: whether rgb and robot are stored, or only their hashes.
+        states, rgb [t h w 3] uint8, robot [t h w 3] uint8: content of an accepted episode; None is not stored.
+        videos: whether to store rgb and robot or only their hashes.
 
     Raises:
         EpisodeError: the folder cannot be written or the disk is full; nothing half-written remains.
@@ -202,25 +202,25 @@ def write_episode(
 
 @contextmanager
 def complete_folder(folder: Path, held: Collection[str] = ()) -> Iterator[Path]:
-    """Give a temporary folder to fill, which takes the name `folder` when the block ends well and else is removed.
+    """Yield a temporary folder, which is renamed to `folder` at the end of the block, or removed after an error.
 
     Args:
-        folder: to make.
-        held: names of what is written there. A folder of that name that holds nothing else is replaced.
+        folder: path of the complete folder.
+        held: names of the files in it. An existing folder with no other files is replaced.
 
     Raises:
-        EpisodeError: the folder holds something else, which is left as it is.
+        EpisodeError: the existing folder holds other files; it is left unchanged.
     """
     _demand_replaceable(folder, held)
     folder.parent.mkdir(parents=True, exist_ok=True)
     sweep(folder, TEMPORARY, ending="-.*")
     temporary = folder.with_name(f"{TEMPORARY}{folder.name}.{os.getpid()}-{secrets.token_hex(4)}")
-    temporary.mkdir()  # by the user's own mask, and not for the user alone as tempfile does
+    temporary.mkdir()  # with the user's umask; tempfile would make it private
     replaced = temporary.with_name(f"{temporary.name}-replaced")
     try:
         yield temporary
         if folder.exists():
-            os.rename(folder, replaced)  # whoever reads it finds it whole or not at all
+            os.rename(folder, replaced)  # a reader finds a complete folder or none
         os.rename(temporary, folder)
     finally:
         for left in (temporary, replaced):
@@ -228,41 +228,42 @@ def complete_folder(folder: Path, held: Collection[str] = ()) -> Iterator[Path]:
 
 
 def _demand_replaceable(folder: Path, held: Collection[str]) -> None:
-    """Raise EpisodeError where something is in a folder's place that was not written here."""
+    """Raise EpisodeError if the path exists and holds files that xew did not write."""
     if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
-        raise EpisodeError(f"{folder} is no folder but stands where one is to be written; move it away.")
+        raise EpisodeError(f"{folder} is not a folder; expected a folder or nothing. Move it away.")
     others = sorted(entry.name for entry in folder.iterdir() if entry.name not in held) if folder.is_dir() else []
     if others:
         raise EpisodeError(
-            f"{folder} is to be replaced and holds {', '.join(others[:3])}, which xew did not write there; move that away, or "
-            "choose another --out."
+            f"{folder} is to be replaced and holds {', '.join(others[:3])}, which xew did not write; move these files away, "
+            "or choose another --out."
         )
 
 
 def _pack(states: States) -> dict[str, np.ndarray]:
-    """Bring arrays to the form in which they are stored: the mask with eight pixels a byte."""
+    """Arrays in their stored form: the mask with eight pixels per byte."""
     arrays = {f.name: getattr(states, f.name) for f in fields(States)}
     arrays["robot_mask"] = np.packbits(states.robot_mask, axis=-1)
     return arrays
 
 
 def read_record(folder: Path) -> Record:
-    """The header of an episode folder. Raises EpisodeError if there is none or it cannot be understood."""
+    """The header of an episode folder. Raises EpisodeError if it is missing or invalid."""
     path = Path(folder) / "episode.json"
     try:
         header = read_json(path)
         version = header.get("schema_version") if isinstance(header, dict) else None
         if isinstance(version, int) and version != SCHEMA_VERSION:
-            raise EpisodeError(f"{path} has schema version {version}, this xew reads {SCHEMA_VERSION}; generate the data anew.")
+            raise EpisodeError(f"{path} has schema version {version}, expected {SCHEMA_VERSION}; generate the data again.")
         return _check_record(parse(Record, header, "its header"))
     except FileNotFoundError as error:
         raise EpisodeError(f"{path} does not exist; `python -m xew.sim_warp.generate` makes episodes.") from error
     except (OSError, ValueError, ConfigError) as error:
-        raise EpisodeError(f"{path} is damaged ({_one_line(error)}); delete its folder and run generate again.") from error
+        reason = "; ".join(str(error).splitlines())
+        raise EpisodeError(f"{path} is damaged ({reason}); delete its folder and run generate again.") from error
 
 
 def _check_record(record: Record) -> Record:
-    """The same header. Raises ValueError for names that could lead elsewhere and for numbers that mean nothing."""
+    """The same header. Raises ValueError for names that are paths and for invalid numbers."""
     try:
         _folder_names(record.task, record.seed, record.robot)
         for name in (*record.object_names, *record.keypoint_names):
@@ -276,16 +277,12 @@ def _check_record(record: Record) -> Record:
     return record
 
 
-def _one_line(error: Exception) -> str:
-    return "; ".join(str(error).splitlines())
-
-
 def demand_known(folder: Path, *names: str) -> None:
-    """Raises EpisodeError if one of these arrays of `States` is unknown in an episode that was imported."""
+    """Raise EpisodeError if one of these arrays of `States` is unknown in an imported episode."""
     record = read_record(folder)
     if missing := [name for name in names if name in record.unknown]:
         raise EpisodeError(
-            f"{folder} was imported from {record.source}, which does not record {', '.join(missing)}; leave it out, or use "
+            f"{folder} was imported from {record.source}, which does not record {', '.join(missing)}; exclude it, or use "
             "episodes made by `python -m xew.sim_warp.generate`."
         )
 
@@ -304,7 +301,7 @@ def read_states(folder: Path) -> States:
 
 
 def _check_camera(states: States) -> States:
-    """The same states. Raises ValueError where their camera could see nothing."""
+    """The same states. Raises ValueError if their camera is invalid."""
     intrinsics, extrinsics = states.intrinsics, states.extrinsics
     if intrinsics.shape != (3, 3) or extrinsics.shape != (4, 4):
         raise ValueError(f"its camera has intrinsics {intrinsics.shape} and extrinsics {extrinsics.shape}")
@@ -314,7 +311,7 @@ def _check_camera(states: States) -> States:
 
 
 def project(points: np.ndarray, intrinsics: np.ndarray, extrinsics: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Images of points of the world by the pinhole camera of all episodes, without distortion or skew.
+    """Project world points by the pinhole camera of all episodes, without distortion or skew.
 
     Pixels: x right, y down, (0, 0) is the center of the upper left pixel. Camera frame: x right, y down, z forward.
 
@@ -324,8 +321,8 @@ def project(points: np.ndarray, intrinsics: np.ndarray, extrinsics: np.ndarray) 
         extrinsics: [4 4] world to camera [m].
 
     Returns:
-        Pixels [... 2] and depths along the optical axis [...] m, both float64 where an argument is. A point at or behind the
-        camera (depth <= 0) has no image; its pixels are NaN.
+        Pixels [... 2] and depths along the optical axis [...] m, both float64 if an argument is. Pixels of points at or behind
+        the camera (depth <= 0) are NaN.
     """
     in_camera = points @ extrinsics[:3, :3].T + extrinsics[:3, 3]
     depth = in_camera[..., 2]
@@ -335,8 +332,8 @@ def project(points: np.ndarray, intrinsics: np.ndarray, extrinsics: np.ndarray) 
 
 
 def read_npz(path: Path) -> dict[str, np.ndarray]:
-    """All arrays of an .npz by name [any shapes]; threads may call it. Raises what zipfile, zlib and NumPy raise."""
-    # Opened here, since np.load leaves a file that is no archive open.
+    """All arrays of an .npz by name [any shapes]; thread-safe. Raises the errors of zipfile, zlib and NumPy."""
+    # Opened here: np.load does not close a file that is no archive.
     with PARSING, demand_regular(path).open("rb") as file, np.load(file) as stored:
         return {name: stored[name] for name in stored.files}
 
@@ -344,19 +341,18 @@ def read_npz(path: Path) -> dict[str, np.ndarray]:
 def write_video(path: Path, video: np.ndarray, frame_rate: float = 1000 / 60) -> None:
     """Write uint8 RGB [t h w 3] losslessly: H.264 in RGB at quantizer 0, in Matroska.
 
-    Scenes stand still but for the robot, which a codec that looks at the frame before writes in a quarter of the time that
-    FFV1 takes, at 1.3 times the size.
+    For these videos it takes a quarter of FFV1's time, at 1.3 times the size.
 
     Raises:
-        OSError: it cannot be written there, or the disk is full.
+        OSError: the file cannot be written, or the disk is full.
     """
     height, width = video.shape[1:3]
-    # bitexact: no random identifiers, the same frames give the same file
+    # bitexact: without random identifiers, equal frames give equal files
     with av.open(str(path), "w", format="matroska", container_options={"fflags": "+bitexact"}) as container:
         rate = Fraction(frame_rate).limit_denominator(1000)
         stream = container.add_stream("libx264rgb", rate=rate, options={"preset": "ultrafast", "qp": "0"})
         stream.width, stream.height, stream.pix_fmt = width, height, "rgb24"
-        stream.codec_context.thread_count = 1  # episodes are written side by side
+        stream.codec_context.thread_count = 1  # several episodes are written in parallel
         for frame in video:
             container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
         container.mux(stream.encode())
@@ -368,29 +364,26 @@ def encode_png(image: np.ndarray) -> bytes:
 
 
 def open_video(path: Path) -> Any:
-    """Open a video as a PyAV container, which reads no other file than this one.
+    """Open a video as a PyAV container that reads no other file.
 
     Raises:
-        OSError: it is no regular file. av.FFmpegError (an OSError, too): it is no Matroska or MP4.
+        OSError: it is not a regular file. av.FFmpegError (an OSError, too): it is not Matroska or MP4.
     """
     options = {"format_whitelist": FORMATS, "protocol_whitelist": "file"}
     return av.open(str(demand_regular(path).absolute()), container_options=options)
 
 
 def take_pixels(frame: av.VideoFrame, pixels: str = "rgb24") -> np.ndarray:
-    """A decoded frame as uint8 [h w c], converted by this thread: PyAV would start one a core for every frame anew.
+    """A decoded frame as uint8 [h w c], converted by this thread; by default PyAV starts a thread per core for every frame.
 
     Args:
-        pixels: name of FFmpeg's format with c channels, such as rgb24 or rgba.
+        pixels: FFmpeg's name of a format with c channels, such as rgb24 or rgba.
     """
     return frame.to_ndarray(format=pixels, threads=1)
 
 
 def read_video(path: Path, most: int | None = None) -> np.ndarray:
-    """Read a video, or its first `most` frames, as uint8 RGB [t h w 3].
-
-    Raises EpisodeError if it is missing or holds no readable frame.
-    """
+    """A video, or its first `most` frames, as uint8 RGB [t h w 3]. Raises EpisodeError if it has no readable frame."""
     try:
         with open_video(path) as container:
             container.streams.video[0].codec_context.thread_count = 1
@@ -399,14 +392,14 @@ def read_video(path: Path, most: int | None = None) -> np.ndarray:
         frames = []
     if not frames:
         raise EpisodeError(
-            f"{path} is missing or holds no readable frame. Data made with --states-only get their videos by "
-            f"`python -m xew.sim_warp.inspect DATA --render`; else delete its folder and run generate again."
+            f"{path} is missing or holds no readable frame. For data made with --states-only, run "
+            f"`python -m xew.sim_warp.inspect DATA --render`; otherwise delete its folder and run generate again."
         )
     return np.stack(frames)
 
 
 def verify_episode(folder: Path) -> Record:
-    """Read all of an accepted episode and compare with its hashes. Raises EpisodeError at the first difference."""
+    """Read an accepted episode and compare it with its hashes. Raises EpisodeError at the first difference."""
     folder = Path(folder)
     record = read_record(folder)
     readers = {
@@ -420,15 +413,15 @@ def verify_episode(folder: Path) -> Record:
             raise EpisodeError(
                 f"{folder} names a hash of {name!r}, expected {', '.join(readers)}; delete it and run generate again."
             )
-        found = readers[name]()
-        if found != expected:
+        digest = readers[name]()
+        if digest != expected:
             raise EpisodeError(
-                f"{folder}: {name} has hash {found[:12]}, expected {expected[:12]}; delete it and run generate again."
+                f"{folder}: {name} has hash {digest[:12]}, expected {expected[:12]}; delete it and run generate again."
             )
     return record
 
 
 def remove_left_overs(data: Path) -> None:
-    """Remove what a run that was killed left half-written: episodes and, one folder up, robots."""
+    """Remove incomplete episodes and robots of killed runs."""
     for folder in [*Path(data).glob(f"*/*/{TEMPORARY}*"), *Path(data).glob(f"*/{TEMPORARY}*")]:
         shutil.rmtree(folder, ignore_errors=True)

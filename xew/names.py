@@ -1,7 +1,7 @@
-"""Names, paths and texts that files give, for all rooms. Data sets, rollouts, runs and score tables may be anybody's.
+"""Names, paths and texts from files of unknown origin: data sets, rollouts, runs and score tables.
 
-A name that one of them holds becomes part of a path only through `check_name` and `path_below`, and a text goes into Markdown
-and CSV through `plain_markdown` and `csv_text`.
+A name from such a file becomes part of a path only through `check_name` and `path_below`. A text enters Markdown or CSV only
+through `plain_markdown` or `csv_text`.
 """
 
 import re
@@ -9,72 +9,72 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 NAME = re.compile(r"\w[\w.+-]*(?::[^\W\d]\w*)?")
-"""Form of the name of a task or robot in a file: a key, or `module:NAME`. It is no path, neither hidden nor an option."""
+"""Form of the name of a task or robot in a file: a key or `module:NAME`, never a path, a hidden file or an option."""
 MOST_LETTERS = 200
 """Largest length of a name [bytes]; file systems take 255 with an ending."""
 SHOWN_LETTERS = 80
-"""Largest number of letters of a wrong name that a message shows."""
+"""Largest number of letters of an invalid name in a message."""
 ACTIVE_TAG = re.compile(
     r"<(?=[A-Za-z/!?])(?!(?!base|embed|form|iframe|link|math|meta|object|plaintext|script|style|svg|template|textarea|title|xmp)"
     r"[a-z]+>)"
 )
-"""Beginnings of HTML tags in Markdown, but for those without attributes that only format, as <frame> in a name."""
+"""Beginnings of HTML tags in Markdown, except formatting tags without attributes."""
 
 
 class EpisodeError(Exception):
-    """An episode, or another thing on disk that should hold one, is not as it should be; the message says what to do."""
+    """An episode or a file that belongs to one is missing or invalid; the message says what to do."""
 
 
 def check_name(name: object, what: str) -> str:
-    """The name of a task or robot, as a file gives it, where it is fit to be a folder's name.
+    """The name of a task or robot from a file, checked for use as a folder name.
 
     Raises:
-        EpisodeError: it is no text, too long, or has other characters than `NAME`; a path is refused so.
+        EpisodeError: it is no text, too long, or does not match `NAME`, for example a path.
     """
     if not isinstance(name, str) or not NAME.fullmatch(name) or len(name.encode()) > MOST_LETTERS:
         raise EpisodeError(
             f"the {what} is {_shorten(name)}, expected a key of letters, digits, _, -, + and dots, or module:NAME; correct it "
-            "where it stands, or leave that file out."
+            "in its file, or remove the file."
         )
     return name
 
 
 def folder_name(name: str) -> str:
-    """The name of a task or robot as a folder's: no colon, which Windows does not allow and scp takes for the end of a host."""
+    """The folder name of a task or robot: without colons, which Windows and scp do not accept."""
     return name.replace(":", "@")
 
 
 def name_of_folder(folder: str) -> str:
-    """The name of a task or robot by its folder's."""
+    """The name of the task or robot of a folder name."""
     return folder.replace("@", ":")
 
 
 def check_label(text: object, what: str) -> str:
-    """The name of a model or condition, as a file gives it, where it is fit to print; it may have spaces and slashes.
+    """The name of a model or condition from a file, checked for printing; it may have spaces and slashes.
 
     Raises:
-        EpisodeError: it is no printable text, or reads as a path to elsewhere.
+        EpisodeError: it is not printable text, or is a path that leads out of its folder.
     """
     if not isinstance(text, str) or not text.isprintable() or len(text) > MOST_LETTERS:
         raise EpisodeError(f"the {what} is {_shorten(text)}, expected printable text of at most {MOST_LETTERS} letters.")
     if text.startswith(("/", "~")) or "\\" in text or ".." in PurePosixPath(text).parts:
-        raise EpisodeError(f"the {what} is {_shorten(text)}, which reads as a path to elsewhere; give it a plain name.")
+        raise EpisodeError(f"the {what} is {_shorten(text)}, a path that leads out of its folder; give it a plain name.")
     return text
 
 
 def path_below(root: Path, *names: str) -> Path:
-    """The path of names below a root, with links followed to see where it ends.
+    """The path of names below a root; links are resolved to check its target.
 
     Raises:
-        EpisodeError: it ends elsewhere than below the root, or links lead in a circle.
+        EpisodeError: the target is not below the root, or links form a circle.
     """
     path = Path(root, *names)
     try:
         end, top = path.resolve(), Path(root).resolve()
     except (OSError, RuntimeError, ValueError) as error:
-        raise EpisodeError(f"{path} leads nowhere ({error}); put the folder or file itself there.") from error
+        raise EpisodeError(f"{path} cannot be resolved ({error}); replace the link with the folder or file.") from error
     if end == top or not end.is_relative_to(top):
-        raise EpisodeError(f"{path} leads to {end}, which is not below {root}; put the folder or file itself there.")
+        raise EpisodeError(f"{path} leads to {end}, which is not below {root}; replace the link with the folder or file.")
     return path
 
 
@@ -84,12 +84,12 @@ def _shorten(name: object) -> str:
 
 
 def plain_markdown(text: str) -> str:
-    """Text as part of Markdown, in which it opens no link, picture, cell of a table, or HTML tag that does anything."""
+    """Text escaped for Markdown: it opens no link, picture, table cell or active HTML tag."""
     return ACTIVE_TAG.sub(r"\\<", text.replace("|", r"\|")).replace("](", r"]\(")
 
 
 def csv_text(frame: Any) -> str:
-    """A table (pandas) as CSV without its index; texts that would begin a spreadsheet's formula get a quote in front."""
+    """A pandas table as CSV without its index; texts that a spreadsheet would read as formulas get a leading quote."""
     texts = {column: frame[column].map(_plain_cell) for column in frame if frame[column].dtype.kind not in "biufcmM"}
     return frame.assign(**texts).rename(columns=_plain_cell).to_csv(index=False)
 

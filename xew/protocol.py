@@ -1,6 +1,6 @@
 """The protocol of a study as plain data: roles of robots, splits, seeds, variants, counts, and the layout of a command.
 
-It follows the paper's section 3 and its appendix. Every room may read this file, which imports nothing of ours.
+It follows the paper's section 3 and its appendix. Every package may import this file, which imports nothing of xew.
 """
 
 import re
@@ -11,7 +11,7 @@ ROBOT_NAMES = ("aloha_agilex", "arx_x5", "ur5_wsg", "franka_panda", "piper")
 """Keys of the five robots of the paper, in its order."""
 SEEN_ROBOTS = ("aloha_agilex", "arx_x5", "ur5_wsg")
 HELD_OUT_ROBOTS = ("franka_panda", "piper")
-"""Roles in the fixed split: three robots train, two are held out and reported apart, never averaged."""
+"""Roles in the fixed split: three training robots, and two held-out robots, reported separately and never averaged."""
 
 BODY_NAME = re.compile(r"body[:_](\d+)")
 BODY_RANGE = re.compile(r"body:(\d+)-(\d+)")
@@ -22,7 +22,7 @@ ACTION_DIM = 16
 closed, to 1, open. Arms of six joints leave their seventh at zero."""
 LEFT_ARM, LEFT_GRIPPER, RIGHT_ARM, RIGHT_GRIPPER = slice(0, 7), 7, slice(8, 15), 15
 ARMS = ((LEFT_ARM, LEFT_GRIPPER), (RIGHT_ARM, RIGHT_GRIPPER))
-"""Places of each arm's joints and gripper in a command."""
+"""Columns of each arm's joints and gripper in a command."""
 
 DIMENSION_TITLES = {
     "visual": "Visual quality",
@@ -30,12 +30,12 @@ DIMENSION_TITLES = {
     "kinematics": "Robot kinematics",
     "objects": "Object dynamics",
 }
-"""Titles of the dimensions, the groups of metrics; they are reported side by side, never as one number."""
+"""Titles of the dimensions, the groups of metrics, which are never combined into one number."""
 
 SHARED_MOTION, OWN_MOTION = "shared", "own"
 MOTIONS = (SHARED_MOTION, OWN_MOTION)
-"""Kinds of motion that episodes may have: all robots of a scene follow one tool path on one clock, so that the body alone
-differs; or each goes between the task's waypoints by a path, in a time and from a rest posture of its own."""
+"""Kinds of motion. Shared: all robots of a scene follow one tool path on one clock; only the body differs. Own: each robot
+moves between the task's waypoints on its own path, in its own time and from its own rest posture."""
 
 FRAME_RATE = 1000 / 60
 """Number of stored frames per second [Hz]: one every 15 physics steps of 4 ms."""
@@ -49,19 +49,19 @@ TEST_SEEDS_PER_TASK = 20
 TEST_SEED_START = 1_000_000
 """First test seed. Training seeds count up from 0 and never reach it."""
 VALIDATION_SEED_START = 800_000
-"""First validation seed. Validation seeds are of the training side, below TEST_SEED_START, and nothing is trained on them:
-samples while a model trains, logs, calibration and whatever is tuned read them. Test seeds are read for the results alone."""
+"""First validation seed. Validation seeds are for samples during training, calibration and tuning, not for training. Test seeds
+are for results only."""
 SEED_STARTS = {"train": 0, "validation": VALIDATION_SEED_START, "test": TEST_SEED_START}
 """First seed of each family."""
 
 
 def body_key(number: int) -> str:
-    """The key of a procedural body in folders, headers and score tables: no colon, which Windows does not allow in a path."""
+    """The key of a procedural body in folders, headers and score tables, without a colon, which Windows forbids in paths."""
     return f"body_{number}"
 
 
 def expand_robots(names: Iterable[str]) -> tuple[str, ...]:
-    """Robots as keys: `body:17` becomes `body_17` and `body:0-63` all of `body_0` to `body_63`; others stay as they are."""
+    """Keys of robots: `body:17` becomes `body_17`, `body:0-63` becomes `body_0` to `body_63`; other names are unchanged."""
     keys: list[str] = []
     for name in names:
         if several := BODY_RANGE.fullmatch(name):
@@ -76,7 +76,7 @@ def expand_robots(names: Iterable[str]) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class Split:
-    """Robots that a model trains on, and robots that it must render unseen."""
+    """Training robots and held-out robots of a model."""
 
     train_robots: tuple[str, ...]
     held_out_robots: tuple[str, ...]
@@ -87,14 +87,14 @@ class Split:
 FIXED = Split(SEEN_ROBOTS, HELD_OUT_ROBOTS)
 """Split of most tables: three robots train, two are held out."""
 LOEO = {held_out: Split(tuple(r for r in ROBOT_NAMES if r != held_out), (held_out,)) for held_out in ROBOT_NAMES}
-"""Leave-one-embodiment-out (LOEO): five folds, each named by the robot that it holds out."""
+"""Leave-one-embodiment-out (LOEO): five folds, by their held-out robot."""
 
 TRAINING_BODIES = expand_robots(["body:0-63"])
-"""Procedural bodies that models may train on, in the order in which the scaling protocol takes them."""
+"""Procedural bodies for training, in the order of the scaling protocol."""
 UNSEEN_BODIES = expand_robots(["body:64-95"])
-"""Bodies that no model trains on; test episodes of theirs are graded."""
+"""Bodies without training episodes; their test episodes are graded."""
 VALIDATION_BODIES = expand_robots(["body:96-103"])
-"""Bodies by which choices are made, so that neither held-out robots nor test bodies have a part in them."""
+"""Bodies for model selection, separate from held-out robots and test bodies."""
 DISTANCE_BODIES = expand_robots(["body:104-167"])
 """Bodies of the wide family of designs, whose kinematic distances span and exceed those among the five robots."""
 BODY_SCALES = (4, 16, 64)
@@ -105,22 +105,22 @@ SCALING = {
     **{f"scaling_bodies_{count}": Split(TRAINING_BODIES[:count], _TESTED) for count in BODY_SCALES},
     **{f"scaling_seen_bodies_{count}": Split((*SEEN_ROBOTS, *TRAINING_BODIES[:count]), _TESTED) for count in BODY_SCALES},
 }
-"""The scaling protocol: the three robots, K bodies, or both; all are tested on Panda, PiPER and 32 unseen bodies. The model of
-the three robots alone is tested on 64 bodies of the wide family, too: one training serves error against distance as well."""
+"""The scaling protocol: training on the three robots, K bodies, or both, with tests on Franka, Piper and 32 unseen bodies. The
+model of the three robots is tested on 64 bodies of the wide family, too, for error against distance."""
 CROSSED_BODIES = DISTANCE_BODIES[:32]
-"""Bodies of the wide family that two models share out, each training on one half and graded on both."""
+"""Bodies of the wide family for two models, each trained on one half and graded on both."""
 HALVES = {
     "halves_even": Split(CROSSED_BODIES[0::2], CROSSED_BODIES[1::2]),
     "halves_odd": Split(CROSSED_BODIES[1::2], CROSSED_BODIES[0::2]),
 }
-"""The protocol of halves: every body is rendered by a model that trained on it and by one that did not, as in the folds of
-LOEO, but with 32 bodies in place of five robots. Keys say which half trains, by the bodies' numbers."""
+"""The protocol of halves: every body is rendered by a model that trained on it and by one that did not, as in LOEO, with 32
+bodies instead of five robots. Keys name the training half by the bodies' numbers."""
 VALIDATION = Split(SEEN_ROBOTS, VALIDATION_BODIES)
-"""The fixed split's training robots, with the bodies by which choices are made in place of the held-out robots."""
+"""The fixed split's training robots, with the validation bodies instead of the held-out robots."""
 
 
 def validation_split(split: Split) -> Split:
-    """Robots by which choices about models of a split are made: its training robots, and bodies as those never seen."""
+    """Robots for model selection in a split: its training robots, and the validation bodies as held-out robots."""
     return replace(split, held_out_robots=VALIDATION_BODIES)
 
 
@@ -133,14 +133,14 @@ _SHARED_SPLITS = (
     {"fixed": FIXED} | {f"loeo_{robot}": split for robot, split in LOEO.items()} | SCALING | HALVES | {"validation": VALIDATION}
 )
 SPLITS = {split_key(key, motion): replace(split, motion=motion) for motion in MOTIONS for key, split in _SHARED_SPLITS.items()}
-"""All splits by key. A plain key is of shared motion; keys of own motion end in `_own`."""
+"""All splits by key; keys of splits in own motion end in `_own`."""
 
 SHOTS = (1, 2, 3)
-"""Numbers of training episodes of each task that a model is adapted with (M); they are of the first accepted seeds."""
+"""Numbers of training episodes per task for few-shot adaptation (M), from the first accepted seeds."""
 FORGETTING_ROBOT = "ur5_wsg"
 """Robot whose test episodes measure forgetting, the same for every adapted model."""
 GRADING_PROTOCOL = 6
-"""Version of the grading: it goes up when any score would change, and scores of another version are graded anew."""
+"""Version of the grading. It increases with every change of scores; scores of another version are graded again."""
 COPY_FIRST_FRAME, PASTED_RENDER, OTHER_ROBOT = "copy_first_frame", "pasted_render", "other_robot"
 CODEC_TRUTH, GROUND_TRUTH = "codec_truth", "ground_truth"
 BASELINES = {
@@ -150,10 +150,9 @@ BASELINES = {
     CODEC_TRUTH: "truth through the codec",
     GROUND_TRUTH: "ground truth",
 }
-"""Titles of the predictions that no model made, by name; they have the empty variant in a score table. The frozen first frame;
-the first frame with the robot's render pasted in, which is as good as one can be without learning; the true episode of
-another robot; the true video through a model's codec, of which the condition says which; and the true video. The scores of the
-last two show the estimators' own error."""
+"""Titles of the baselines by name; they have the empty variant in a score table. The pasted render, the first frame with the
+robot's render, is the no-learning baseline. The condition of the truth through the codec names the codec. The scores of the
+last two show the estimators' error."""
 
 
 @dataclass(frozen=True)
@@ -161,27 +160,28 @@ class Variant:
     """One trained or adapted model of a study."""
 
     name: str
-    """Unique name, which is also a folder's name."""
+    """Unique name, also the folder's name."""
     system: str = "reference"
     """Key of the world model: reference, irasim, ctrl_world, enerverse_ac, bwm, or an outside model's name."""
     split: str = "fixed"
     """Key of SPLITS."""
     action: str = "optical_flow"
-    """Key of the model's ACTIONS: the condition that shows the commanded motion."""
+    """Key of the model's ACTIONS: the condition on the commanded motion."""
     embodiment: str = "none"
-    """Key of the model's CONDITIONS: the condition that shows the robot's looks."""
+    """Key of the model's CONDITIONS: the condition on the robot's appearance."""
     target: str | None = None
-    """Robot that it was adapted to, if any."""
+    """Target robot of the adaptation, if any."""
     shots: int = 0
-    """Number of episodes of each task in the adaptation (M)."""
+    """Number of episodes per task in the adaptation (M)."""
     remedy: str = "full"
     """Kind of adaptation: full (all weights, as in the paper), replay (of training robots' episodes) or lora."""
 
     @property
     def graded_robots(self) -> tuple[str, ...]:
-        """Robots whose test episodes it predicts: those of the five that its split has, then the bodies that it holds out;
-        after an adaptation FORGETTING_ROBOT and the target. Of the bodies that a model trains on only those of the wide family
-        have test episodes."""
+        """Robots whose test episodes it predicts: the split's robots, training bodies of the wide family, held-out bodies.
+
+        For an adaptation they are FORGETTING_ROBOT and the target.
+        """
         if self.target is not None:
             return FORGETTING_ROBOT, self.target
         split = SPLITS[self.split]
@@ -191,17 +191,17 @@ class Variant:
 
     @property
     def seen_robots(self) -> tuple[str, ...]:
-        """Graded robots that its first training had."""
+        """Graded robots of the training before any adaptation."""
         return tuple(robot for robot in self.graded_robots if robot in SPLITS[self.split].train_robots)
 
     @property
     def held_out_robots(self) -> tuple[str, ...]:
-        """Graded robots that its first training did not have; they are reported apart, never averaged."""
+        """Graded robots held out from the training before any adaptation; reported separately, never averaged."""
         return tuple(robot for robot in self.graded_robots if robot in SPLITS[self.split].held_out_robots)
 
     @property
     def start(self) -> "Variant | None":
-        """The variant that an adapted one starts from."""
+        """The variant from which an adaptation starts."""
         return None if self.target is None else reference(self.split, self.action, self.embodiment)
 
 
@@ -211,7 +211,7 @@ def reference(split: str = "fixed", action: str = "optical_flow", embodiment: st
 
 
 def system(name: str) -> Variant:
-    """Another project's way to condition on actions, in our network and on the fixed split."""
+    """Another project's action conditioning, in xew's network and on the fixed split."""
     return Variant(f"fixed-{name}", name, "fixed", name)
 
 
@@ -222,7 +222,7 @@ def adaptation(target: str, shots: int, remedy: str = "full") -> Variant:
 
 
 MULTI_VIEW = ("optical_flow", "nine_views")
-"""Conditions on action and looks of the model that adaptations start from (the paper's appendix on few-shot adaptation)."""
+"""Action and appearance conditions of the model from which adaptations start (the paper's appendix on few-shot adaptation)."""
 _FEW_SHOT = tuple(adaptation(target, shots) for target in HELD_OUT_ROBOTS for shots in SHOTS)
 _RENDERED = reference(embodiment="robot_render")
 
@@ -232,20 +232,20 @@ PARTS: dict[str, tuple[Variant, ...]] = {
     "ladder": tuple(
         reference(embodiment=name) for name in ("none", "reference_image", "nine_views", "articulation_clip", "robot_render")
     ),
-    # The paper does not say which conditions its folds get; their Franka and Piper scores agree with those of nine views.
+    # The paper does not state the folds' conditions; their Franka and Piper scores agree with the nine-view model's.
     "loeo": tuple(reference(f"loeo_{robot}", *MULTI_VIEW) for robot in ROBOT_NAMES),
     "few_shot": (reference("fixed", *MULTI_VIEW), *_FEW_SHOT, _RENDERED),
     "forgetting": (reference("fixed", *MULTI_VIEW), *_FEW_SHOT),
     "baselines": (*(system(name) for name in ("irasim", "ctrl_world", "enerverse_ac")), reference()),
-    # Ours; the paper leaves them open.
+    # Not in the paper.
     "remedies": tuple(
         adaptation(target, shots, remedy) for remedy in ("replay", "lora") for target in HELD_OUT_ROBOTS for shots in SHOTS
     ),
     "more_systems": (system("bwm"),),
-    # Ours, with procedural bodies, which the paper does not have. These models get the robot's render at every frame.
+    # Not in the paper: procedural bodies, conditioned on the robot's render at every frame.
     "scaling": tuple(reference(split, embodiment="robot_render") for split in SCALING),
     "bodies": (reference("scaling_seen", embodiment="robot_render"),),
-    # Told what the folds of LOEO are told.
+    # With the conditions of the LOEO folds.
     "halves": tuple(reference(split, *MULTI_VIEW) for split in HALVES),
 }
 """Variants that each table compares, in the order of its rows. A variant may be in several parts."""
@@ -261,14 +261,7 @@ def expected_counts(
     test_seeds: int = TEST_SEEDS_PER_TASK,
     robots: tuple[str, ...] = ROBOT_NAMES,
 ) -> dict[str, int]:
-    """Number of scored episodes of each robot in a complete table: 500 in the paper, fewer in a smaller study.
-
-    Args:
-        variant: the model.
-        tasks: number of the study's tasks.
-        test_seeds: number of its test seeds of each task.
-        robots: its robots.
-    """
+    """Number of scored episodes of each robot in a complete table: 500 in the paper, fewer in a smaller study."""
     return {robot: tasks * test_seeds for robot in variant.graded_robots if robot in robots}
 
 
@@ -278,20 +271,10 @@ def training_counts(
     train_seeds: int = TRAIN_SEEDS_PER_TASK,
     robots: tuple[str, ...] = ROBOT_NAMES,
 ) -> dict[str, int]:
-    """Number of episodes of each robot that a variant learns from; of an adaptation, those of the target without replay."""
+    """Number of training episodes of each robot; for an adaptation, of the target without replay."""
     if variant.target is not None:
         return {variant.target: tasks * variant.shots} if variant.target in robots else {}
     return {robot: tasks * train_seeds for robot in SPLITS[variant.split].train_robots if robot in robots}
-
-
-def split_counts(
-    split: Split,
-    tasks: int = TASK_COUNT,
-    train_seeds: int = TRAIN_SEEDS_PER_TASK,
-    test_seeds: int = TEST_SEEDS_PER_TASK,
-) -> tuple[int, int]:
-    """Numbers of training episodes of a split and of test episodes of its held-out robots: 1,250 and 500 a robot."""
-    return len(split.train_robots) * tasks * train_seeds, len(split.held_out_robots) * tasks * test_seeds
 
 
 def seed_split(seed: int) -> str:

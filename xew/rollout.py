@@ -1,13 +1,13 @@
-"""The other contract between rooms: a rollout, which is a model's video of one episode.
+"""The contract for rollouts: a rollout is a model's video of one episode.
 
-A rollout tree mirrors the data set, `<rollouts>/<task>/<seed>/<robot>/`, and holds in each folder
-    one video       rgb.mkv as our own model writes it (lossless), or any one *.mkv, *.mp4 or *.npz (one array
-                    [t h w 3] uint8), or PNG files, frames in the order of the numbers in their names; RGB of 8 bits, native
-                    size, constant rate, frame 0 the given frame
-    rollout.json    optional: model, condition, frame_count (frames that were asked for), source_hash (of the episode's rgb),
-                    and what else the model wants to say
-Without rollout.json the model is named after the tree's folder and the video must be as long as its episode.
-Trees come from anybody: nothing outside them is read, and no video is read in part or otherwise than it says it is.
+A rollout tree mirrors the data set, `<rollouts>/<task>/<seed>/<robot>/`. Each folder holds
+    one video       rgb.mkv as xew's own model writes it (lossless), or one *.mkv, *.mp4 or *.npz (one array [t h w 3] uint8),
+                    or PNG files in the order of the numbers in their names; RGB of 8 bits, native size, constant rate,
+                    frame 0 the given frame
+    rollout.json    optional: model, condition, frame_count (requested frames), source_hash (of the episode's rgb), and any
+                    further keys
+Without rollout.json the model is named after the tree's folder, and the video must be as long as its episode.
+Trees may be of unknown origin: files outside a tree are not read, and a video that is incomplete or mislabeled is an error.
 """
 
 import json
@@ -22,25 +22,25 @@ import numpy as np
 
 from xew.episode import SEED_END, EpisodeError, complete_folder, open_video, place_episode, read_npz, take_pixels, write_video
 from xew.files import demand_regular, read_json
-from xew.names import check_label, check_name, name_of_folder
+from xew.names import check_label, check_name, name_of_folder, path_below
 
 VIDEO_SUFFIXES = (".mkv", ".mp4", ".npz")
 RATE_TOLERANCE = 0.01
-"""Relative; containers round times to a tick, and people 16.667 to two digits. 16 frames a second are another rate."""
+"""Largest relative difference of frame rates; containers round times to a tick, and people 16.667 to two digits."""
 GAP_TOLERANCE = 0.1
-"""Relative, or a tick and a half of the container's clock: by how much one frame may come early in a constant rate."""
+"""Largest relative difference of the gaps between frames at a constant rate; at least 1.5 ticks of the container's clock."""
 HELD = ("rgb.mkv", "rollout.json")
-"""Names of the files of a rollout of ours. A folder that holds anything else is never replaced by one."""
+"""Names of the files of a rollout that xew writes. A folder with any other file is never replaced."""
 PNG_END = b"IEND\xaeB`\x82"
 
 
 class RolloutError(EpisodeError):
-    """A rollout is missing or is not as it should be; the message says what to do."""
+    """A rollout is missing or invalid; the message says what to do."""
 
 
 @dataclass(frozen=True)
 class Rollout:
-    """One rollout on disk: which episode it predicts, who made it, and where its frames are."""
+    """One rollout on disk: its episode, its model and the files of its frames."""
 
     folder: Path
     task: str
@@ -49,11 +49,11 @@ class Rollout:
     model: str
     condition: str
     frame_count: int | None
-    """Frames that were asked for, counted from the episode's first; None: all of them."""
+    """Number of requested frames, counted from the episode's first; None: all."""
     video: tuple[Path, ...]
-    """One file of many frames, or the PNG files of one frame each."""
+    """One video file, or one PNG file per frame."""
     header: dict[str, Any] = field(default_factory=dict, repr=False)
-    """rollout.json as it is."""
+    """Content of rollout.json."""
 
 
 def write_rollout(root: Path, task: str, seed: int, robot: str, video: np.ndarray, header: dict[str, Any]) -> Path:
@@ -61,9 +61,9 @@ def write_rollout(root: Path, task: str, seed: int, robot: str, video: np.ndarra
 
     Args:
         root: of the rollout tree.
-        task, seed, robot: the episode that is predicted.
-        video: [t h w 3] uint8 RGB at the camera's size, the given first frame included.
-        header: goes to rollout.json; model and condition belong there, frame_count is filled in.
+        task, seed, robot: the predicted episode.
+        video: [t h w 3] uint8 RGB at the camera's size, with the given first frame.
+        header: content of rollout.json, with model and condition; frame_count is filled in.
 
     Raises:
         RolloutError: the folder cannot be written or the disk is full; nothing half-written remains.
@@ -83,10 +83,10 @@ def find_rollouts(root: Path, problems: list[str] | None = None) -> list[Rollout
 
     Args:
         root: of the tree.
-        problems: where given, folders that cannot be understood are told here, one message each, and left out.
+        problems: list to which one message is added for each invalid folder, which is then left out.
 
     Raises:
-        RolloutError: there is none, or a folder cannot be understood.
+        RolloutError: there is no rollout, or a folder is invalid and `problems` is None.
     """
     root = Path(root)
     folders = [folder for folder in sorted(root.glob("*/*/*")) if folder.is_dir() and not folder.name.startswith(".")]
@@ -94,58 +94,56 @@ def find_rollouts(root: Path, problems: list[str] | None = None) -> list[Rollout
         raise RolloutError(
             f"no rollout under {root}, expected <task>/<seed>/<robot>/; make some: python -m xew.model.rollout RUN --out {root}"
         )
-    found = []
+    rollouts = []
     for folder in folders:
         try:
-            found.append(read_rollout(folder))
+            rollouts.append(read_rollout(folder))
         except RolloutError as error:
             if problems is None:
                 raise
             problems.append(str(error))
-    return found
+    return rollouts
 
 
 def read_rollout(folder: Path) -> Rollout:
     """The rollout in a folder `<root>/<task>/<seed>/<robot>`, without its frames. Raises RolloutError as `find_rollouts`."""
     folder = Path(folder)
     path = folder / "rollout.json"
-    video = _find_video(folder)
-    for file in (path, *video):
-        _check_inside(folder.parents[2], file)
-    header = _read_header(path)
-    frame_count = header.get("frame_count")
-    if frame_count is not None and (not isinstance(frame_count, int) or isinstance(frame_count, bool) or frame_count < 1):
-        raise RolloutError(f"{path}: frame_count is {frame_count!r}, expected a positive whole number.")
-    task, seed, robot = name_of_folder(folder.parts[-3]), folder.parts[-2], name_of_folder(folder.name)
-    if not seed.isdecimal() or int(seed) >= SEED_END:
-        raise RolloutError(f"{folder}: the folder above it is {seed!r}, expected a seed; the tree is <task>/<seed>/<robot>/.")
+    video, root = _find_video(folder), folder.parents[2]
     try:
-        check_name(task, "task")
-        check_name(robot, "robot")
+        for file in (path, *video):
+            path_below(root, str(file.relative_to(root)))
+        header = _read_header(path)
+        frame_count = header.get("frame_count")
+        if frame_count is not None and (not isinstance(frame_count, int) or isinstance(frame_count, bool) or frame_count < 1):
+            raise RolloutError(f"{path.name}: frame_count is {frame_count!r}, expected a positive whole number.")
+        seed = folder.parts[-2]
+        if not seed.isdecimal() or int(seed) >= SEED_END:
+            raise RolloutError(f"the folder above it is {seed!r}, expected a seed; the tree is <task>/<seed>/<robot>/.")
+        return Rollout(
+            folder=folder,
+            task=check_name(name_of_folder(folder.parts[-3]), "task"),
+            seed=int(seed),
+            robot=check_name(name_of_folder(folder.name), "robot"),
+            model=check_label(header.get("model", root.resolve().name), "model in rollout.json"),
+            condition=check_label(header.get("condition", ""), "condition in rollout.json"),
+            frame_count=frame_count,
+            video=video,
+            header=header,
+        )
     except EpisodeError as error:
         raise RolloutError(f"{folder}: {error}") from error
-    return Rollout(
-        folder=folder,
-        task=task,
-        seed=int(seed),
-        robot=robot,
-        model=_name(path, "model", header.get("model", folder.parents[2].resolve().name)),
-        condition=_name(path, "condition", header.get("condition", "")),
-        frame_count=frame_count,
-        video=video,
-        header=header,
-    )
 
 
 def read_rollout_video(rollout: Rollout, frame_rate: float | None = None) -> np.ndarray:
     """The frames, uint8 RGB [t h w 3].
 
     Args:
-        rollout: as found.
-        frame_rate: what a container must say, in frames a second; None: whatever it says.
+        rollout: the rollout.
+        frame_rate: required frame rate of a container [Hz]; None accepts any.
 
     Raises:
-        RolloutError: they cannot all be read, are no RGB video of 8 bits, or come at another or a changing rate.
+        RolloutError: a frame cannot be read, the video is not RGB of 8 bits, or its rate is wrong or variable.
     """
     first = rollout.video[0]
     if first.suffix == ".png":
@@ -158,29 +156,11 @@ def read_rollout_video(rollout: Rollout, frame_rate: float | None = None) -> np.
 
 
 def resize_video(video: np.ndarray, size: tuple[int, ...]) -> np.ndarray:
-    """Resize frames [t h w 3] uint8 to a height and width, by areas where these are smaller, as rollouts are graded."""
+    """Resize frames [t h w 3] uint8 to a height and width as for grading: by areas to a smaller size, else bicubic."""
     if video.shape[1:3] == size:
         return video
     method = cv2.INTER_AREA if video.shape[1] > size[0] else cv2.INTER_CUBIC
     return np.stack([cv2.resize(frame, size[::-1], interpolation=method) for frame in video])
-
-
-def _check_inside(root: Path, file: Path) -> None:
-    """Raise RolloutError where links lead out of the tree."""
-    try:
-        end = file.resolve()
-    except (OSError, RuntimeError) as error:
-        raise RolloutError(f"{file} leads nowhere ({error}); put the file itself there.") from error
-    if not end.is_relative_to(root.resolve()):
-        raise RolloutError(f"{file} leads to {end}, out of the tree {root}; put the file itself there.")
-
-
-def _name(path: Path, key: str, name: object) -> str:
-    """A name that is fit to print and to name a file with."""
-    try:
-        return check_label(name, key)
-    except EpisodeError as error:
-        raise RolloutError(f"{path}: {error}") from error
 
 
 def _read_header(path: Path) -> dict[str, Any]:
@@ -189,9 +169,9 @@ def _read_header(path: Path) -> dict[str, Any]:
     except FileNotFoundError:
         return {}
     except (OSError, ValueError) as error:
-        raise RolloutError(f"{path} is damaged ({error}); make this rollout again, or delete the file.") from error
+        raise RolloutError(f"{path.name} is damaged ({error}); make this rollout again, or delete the file.") from error
     if not isinstance(header, dict):
-        raise RolloutError(f"{path} holds {type(header).__name__}, expected an object with model, condition, frame_count.")
+        raise RolloutError(f"{path.name} holds {type(header).__name__}, expected an object with model, condition, frame_count.")
     return header
 
 
@@ -202,9 +182,9 @@ def _find_video(folder: Path) -> tuple[Path, ...]:
         return (files[0],)
     if images and not files:
         return tuple(images)
-    found = ", ".join(str(file.relative_to(folder)) for file in files) or "none"
+    names = ", ".join(str(file.relative_to(folder)) for file in files) or "none"
     raise RolloutError(
-        f"{folder}: found videos {found} and {len(images)} PNG files; expected one *.mkv, *.mp4 or *.npz, or PNG frames alone."
+        f"{folder}: found videos {names} and {len(images)} PNG files; expected one *.mkv, *.mp4 or *.npz, or PNG frames alone."
     )
 
 
@@ -215,7 +195,7 @@ def _number_key(path: Path) -> list[tuple[int, str]]:
 
 
 def _read_container(path: Path, frame_rate: float | None) -> np.ndarray:
-    """All frames of an mkv or mp4. Raises RolloutError where that is not what the file promises."""
+    """All frames of an mkv or mp4. Raises RolloutError if they differ from the file's metadata."""
     frames: list[np.ndarray] = []
     times: list[float] = []
     try:
@@ -225,7 +205,7 @@ def _read_container(path: Path, frame_rate: float | None) -> np.ndarray:
             stream = container.streams.video[0]
             _check_pixels(path, stream.codec_context.format)
             stream.codec_context.thread_count = 1
-            stream.codec_context.options = {"err_detect": "explode"}  # else what is lost is painted over from its neighbors
+            stream.codec_context.options = {"err_detect": "explode"}  # otherwise FFmpeg conceals lost blocks
             for frame in container.decode(stream):
                 frames.append(_rgb(path, frame))
                 times.append(float(frame.pts * frame.time_base) if frame.pts is not None else np.nan)
@@ -238,25 +218,25 @@ def _read_container(path: Path, frame_rate: float | None) -> np.ndarray:
     if len(frames) < promised:
         raise RolloutError(f"{path} is cut off: {len(frames)} frames can be read of {promised}; make this rollout again.")
     if len({frame.shape for frame in frames}) > 1:
-        raise RolloutError(f"{path} changes its size on the way; make this rollout again.")
+        raise RolloutError(f"{path} changes its size; make this rollout again.")
     if frame_rate is not None and len(frames) > 1:
         _check_rate(path, np.array(times), tick, frame_rate)
     return np.stack(frames)
 
 
 def _rgb(path: Path, frame: Any) -> np.ndarray:
-    """A decoded frame as RGB [h w 3]. OpenCV writes FFV1 with an alpha channel that hides nothing; any other is an error."""
+    """A decoded frame as RGB [h w 3]. An opaque alpha channel, as OpenCV writes for FFV1, is dropped; others are errors."""
     if not any(component.is_alpha for component in frame.format.components):
         return take_pixels(frame)
     image = take_pixels(frame, "rgba")
     if image[..., 3].min() < 255:
-        raise RolloutError(f"{path} has an alpha channel ({frame.format.name}) that hides something; convert before grading.")
+        raise RolloutError(f"{path} has an alpha channel ({frame.format.name}) that is not opaque; convert before grading.")
     return image[..., :3]
 
 
 def _check_pixels(path: Path, pixels: Any) -> None:
     """Raise RolloutError unless the format is color with 8 bits a channel."""
-    components = pixels.components if pixels else ()  # None where so little can be read that there is no format
+    components = pixels.components if pixels else ()  # the format is None if too little can be read
     kind = ""
     if len(components) == 1 and not pixels.has_palette:
         kind = "gray frames"
@@ -267,30 +247,30 @@ def _check_pixels(path: Path, pixels: Any) -> None:
 
 
 def _promised_frames(container: Any, stream: Any, times: list[float]) -> int:
-    """How many frames the container says that it holds; 0 where it does not say."""
+    """Number of frames by the container's metadata; 0 if unknown."""
     if stream.frames:
         return int(stream.frames)
     if container.duration is None or len(container.streams) != 1 or len(times) < 2 or times[-1] <= times[0]:
         return 0
     gap = (times[-1] - times[0]) / (len(times) - 1)
-    last = max(gap, float(1 / stream.average_rate) if stream.average_rate else 0.0)  # how long the last frame is shown
+    last = max(gap, float(1 / stream.average_rate) if stream.average_rate else 0.0)  # duration of the last frame
     return len(times) + round((container.duration / av.time_base - times[-1] - last) / gap)
 
 
 def _check_rate(path: Path, times: np.ndarray, tick: float, frame_rate: float) -> None:
-    """Raise RolloutError unless frames come at a constant rate, and at this one."""
+    """Raise RolloutError unless the rate is constant and equals `frame_rate`."""
     gaps = np.diff(times)
     middle = float(np.median(gaps))
     if not np.all(np.abs(gaps - middle) <= max(1.5 * tick, GAP_TOLERANCE * middle)):
         raise RolloutError(
             f"{path} has a variable frame rate (from frame to frame {1000 * gaps.min():.0f} to {1000 * gaps.max():.0f} ms), "
-            "expected a constant one; where its frames are the episode's one by one all the same: --allow rate."
+            "expected a constant one; if its frames match the episode's one by one, pass --allow rate."
         )
     rate = 1 / float(np.mean(gaps))
     if abs(rate / frame_rate - 1) > RATE_TOLERANCE:
         raise RolloutError(
-            f"{path} has {rate:.2f} frames a second, its episode {frame_rate:.2f}; write the episode's rate, or, where its "
-            "frames are the episode's one by one all the same: --allow rate."
+            f"{path} has {rate:.2f} frames per second, its episode {frame_rate:.2f}; write the episode's rate, or, if its "
+            "frames match the episode's one by one, pass --allow rate."
         )
 
 
@@ -300,14 +280,14 @@ def _read_pngs(paths: tuple[Path, ...]) -> np.ndarray:
         frame = _read_png(path)
         if frames and frame.shape != frames[0].shape:
             raise RolloutError(
-                f"{path} is {frame.shape[:2]}, the frames before it are {frames[0].shape[:2]}; sizes must be one."
+                f"{path} is {frame.shape[:2]}, the frames before it are {frames[0].shape[:2]}; expected one size."
             )
         frames.append(frame)
     return np.stack(frames)
 
 
 def _read_png(path: Path) -> np.ndarray:
-    """RGB of 8 bits [h w 3]; what OpenCV would quietly convert or fill up is an error."""
+    """RGB of 8 bits [h w 3]; other formats and truncated files, which OpenCV would accept, are errors."""
     try:
         content = demand_regular(path).read_bytes()
     except OSError as error:
@@ -330,7 +310,7 @@ def _read_npz(path: Path) -> np.ndarray:
 
 
 def _check_video(path: Path, video: np.ndarray) -> np.ndarray:
-    """The video itself. Raises RolloutError with what it is instead where it is not [t h w 3] uint8 with a frame."""
+    """The same video. Raises RolloutError unless it is [t h w 3] uint8 with at least one frame."""
     if video.dtype == np.uint8 and video.ndim == 4 and video.shape[-1] == 3 and video.size:
         return video
     kind = ""

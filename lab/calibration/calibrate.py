@@ -85,7 +85,7 @@ class Args:
     cases: tuple[str, ...] = tuple(PREDICTORS)
     """Names of the predictors that are graded."""
     trust: tuple[str, ...] = ()
-    """Modules of your own, such as my_lab.tasks, that the run and the data may name."""
+    """Custom modules, such as my_lab.tasks, that the run and the data may name."""
 
 
 @dataclass(frozen=True)
@@ -191,7 +191,7 @@ def choose(episodes: Sequence[Episode], args: Args) -> list[Episode]:
 
 
 def _take_turns(episodes: Sequence[Episode]) -> list[Episode]:
-    """Robots by turns, each beginning elsewhere, so that the first few are of many robots and tasks."""
+    """Episodes of robots in alternation, with different starts: the first few are of many robots and tasks."""
     queues = []
     for index, robot in enumerate(dict.fromkeys(record.robot for _, record in episodes)):
         own = [episode for episode in episodes if episode[1].robot == robot]

@@ -28,7 +28,7 @@ STEPS: tuple[tuple[str, ...], ...] = (
     ("other robot", "frozen", "shuffled"),
     ("gray",),
 )
-"""Predictors from right to wrong; those of one step are not compared with each other."""
+"""Predictors from right to wrong; predictors of one step are not compared with each other."""
 FURTHER = (("object at rest", "object erased"),)
 """Further pairs, the better one first, for metrics of objects."""
 

@@ -28,7 +28,7 @@ class Perturbation:
     mask: np.ndarray
     """[t h w] bool, the robot."""
     keypoints: np.ndarray
-    """[t k 2] float32 [pixels], those of `States.keypoints`."""
+    """[t k 2] float32 [pixels], as `States.keypoints`."""
     objects: np.ndarray
     """[t o 2] float32 [pixels], projected origins of the objects' poses."""
 

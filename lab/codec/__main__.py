@@ -49,7 +49,7 @@ from xew.model.video.comparison import strip
 from xew.model.video.frames import to_model_size
 
 SMALLEST_DEVIATION = 1e-3
-"""Smallest deviation of a latent channel, so that one that the autoencoder leaves unused is not blown up."""
+"""Smallest deviation of a latent channel; unused channels are not amplified."""
 ENDLESS = 2**40
 """Number of steps of a training whose time ends it."""
 
@@ -183,7 +183,7 @@ def finish(
 
 
 def write_description(experiment: CodecExperiment, description: dict[str, Any]) -> None:
-    """Write the file beside the weights."""
+    """Write the file next to the weights."""
     path = experiment.out / "autoencoder.json"
     write_text(path, json.dumps(description, indent=1) + "\n")
 

@@ -67,13 +67,13 @@ class CodecTrainSettings:
     lpips: float = 0.2
     """Weight of LPIPS."""
     lpips_frames: int = 1
-    """Number of frames of each clip that LPIPS is taken on, drawn anew each step; 0 takes all."""
+    """Number of frames of each clip for LPIPS, drawn at each step; 0 for all."""
     penalty: float = 1e-3
     """Weight of the latents' mean square."""
     noise: float = 0.1
     """Standard deviation of the noise on latents before they are decoded."""
     region: float = 0.0
-    """Weight of the robot's pixels beyond that of the others, in l1 and mse."""
+    """Additional weight of the robot's pixels in l1 and mse."""
     still: float = 0.1
     """Share of samples that show one frame of the clip at all times, as a codec's first group does."""
     permute: float = 0.25
@@ -93,9 +93,9 @@ class ReportSettings:
     clips: int = 4
     """Number of clips of each robot and stream."""
     trained_robots: int = 3
-    """Number of robots that were trained on which are measured beside the others."""
+    """Number of training robots that are measured in addition."""
     robots: tuple[str, ...] = ()
-    """Robots that are measured beside those; all that were not trained on where left out."""
+    """Further robots to measure; default: all that are not trained on."""
     test_seeds: bool = False
     """Whether test seeds are read, and not training seeds."""
     pictures: bool = True
@@ -120,7 +120,7 @@ class CodecExperiment:
     size: str = "base"
     """Size of the autoencoder, one of AUTOENCODERS."""
     robots: tuple[str, ...] = ()
-    """Robots that are learned from, by name (`body:0-63` names 64 procedural bodies); those of `split` where left out."""
+    """Training robots by name (`body:0-63` for 64 procedural bodies); default: the robots of `split`."""
     split: str = "fixed"
     """Split, one of protocol.SPLITS, whose training robots are learned from where no robots are named; it names the kind of
     motion, too."""

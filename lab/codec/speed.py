@@ -1,4 +1,4 @@
-"""The shipped codec beside Wan2.2's autoencoder: encoding and decoding the same clips of 320x256, in one run on one device.
+"""The shipped codec compared with Wan2.2's autoencoder: encoding and decoding equal clips of 320x256, in one run on one device.
 
     python -m lab.codec.speed [--frames 33] [--clips 4] [--rounds 5] [--dtype bfloat16] [--wan wan22]
 

@@ -126,7 +126,7 @@ def make_codec_optimizer(settings: CodecTrainSettings) -> optax.GradientTransfor
 def make_codec_step(
     graph: nnx.GraphDef, statistics: Any, experiment: CodecExperiment
 ) -> Callable[[TrainState, Batch], tuple[TrainState, Losses]]:
-    """The compiled step; its noise depends on the seed and the step alone, so that a resumed run repeats it."""
+    """The compiled step; its noise depends on the seed and the step alone: a resumed run repeats it."""
     settings, optimizer = experiment.train, make_codec_optimizer(experiment.train)
 
     @functools.partial(jax.jit, donate_argnums=0)

@@ -1,7 +1,7 @@
 """Write the shapes of `lab.robots.shapes` into the five URDFs: `python -m lab.robots.author`.
 
 The URDFs hold each robot's tree (joints, limits, inertials) and are edited by hand for that. Their materials, visuals
-and collisions, and the meshes beside them, are output of this command; a test holds that they are up to date.
+and collisions, and their meshes, are output of this command; a test holds that they are up to date.
 """
 
 import importlib

@@ -181,7 +181,7 @@ def catalog_text(entries: Sequence[Entry]) -> str:
 
 
 def digest_lines(entries: Sequence[Entry]) -> Iterator[str]:
-    """A line a body with the digest of its files, then one with that of all."""
+    """One line per body with the digest of its files, then a line with the digest of all."""
     together = hashlib.sha256()
     for number, entry in enumerate(entries):
         digest = hashlib.sha256()

@@ -88,7 +88,7 @@ class Loading:
 
 @dataclass(frozen=True)
 class Everything:
-    """Run all of the above, each in a process of its own, and write what they print to files."""
+    """Run all measurements, each in a separate process, and write their output to files."""
 
     out: Path
     """Folder for a text file each, and the plot of distances."""

@@ -53,7 +53,7 @@ def _task_seeds(seeds: dict[int, dict[str, Record]], robots: set[str]) -> TaskSe
 
 
 def to_json(manifest: Manifest) -> str:
-    """The text of a manifest's file, a line a task and list, so that a change of one seed is a change of one line."""
+    """The text of a manifest's file, one line per task and list: a change of one seed changes one line."""
     plain = cattrs.unstructure(manifest)
     head = {name: plain[name] for name in ("robots", "device", "versions")}
     tasks = [f"  {json.dumps(task)}: {{\n   {_lines(seeds, '   ')}\n  }}" for task, seeds in plain["tasks"].items()]

@@ -1,11 +1,10 @@
-"""The command that tells how far the tool paths of robots lie apart, in shared motion and in motion of their own.
+"""Distances between the tool paths of robots, in shared motion and in own motion.
 
 Reads  the registries of tasks and robots
 Writes two Markdown tables to the terminal, by task and by robot
 
-It looks at the commands alone, without physics. Paths are compared at equal phase, that is where the plan is at the same
-instant of its own clock: a robot that takes longer on the same way is at distance 0. Scenes whose plan some robot cannot
-follow in either kind of motion are left out.
+It compares commands without physics. Paths are compared at equal phase of the plan: a robot that is slower on the same path
+has a distance of 0. Scenes are omitted if a robot cannot follow the plan in one kind of motion.
 
 Command: python -m lab.seeds.motions [--tasks … --robots … --seeds 4 --first-seed 0]
 """
@@ -22,7 +21,7 @@ from xew.config import user_errors
 from xew.episode import EpisodeError
 from xew.protocol import FRAME_RATE, MOTIONS, expand_robots
 from xew.sim_warp.devices.workers import quiet_warp
-from xew.sim_warp.kinematics import tool_poses
+from xew.sim_warp.kinematics.forward import tool_poses
 from xew.sim_warp.plan import Timeline, ToolPath, frame_times
 from xew.sim_warp.production.cells import Cell, Job, plan_cells
 from xew.sim_warp.robots import ROBOTS, get_robot
@@ -38,7 +37,7 @@ class Args:
     tasks: tuple[str, ...] = tuple(TASKS)
     """Keys of the registry, or module:NAME."""
     robots: tuple[str, ...] = tuple(ROBOTS)
-    """Keys of the registry, bodies (body:17, body:0-63), module:NAME, or paths of your own (docs/add_a_robot.md)."""
+    """Keys of the registry, bodies (body:17, body:0-63), module:NAME, or paths (docs/add_a_robot.md)."""
     seeds: int = 4
     """Number of seeds of each task."""
     first_seed: int = 0

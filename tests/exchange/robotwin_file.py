@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from xew.episode import HEIGHT, WIDTH
 from xew.sim_warp.geometry.camera import HEAD_CAMERA
 from xew.sim_warp.geometry.poses import matrix_from_pose, pose_from_matrix
-from xew.sim_warp.kinematics import tool_matrix
+from xew.sim_warp.kinematics.forward import tool_matrix
 from xew.sim_warp.robots import ROBOTS, RobotSpec
 
 RED = (200, 30, 20)

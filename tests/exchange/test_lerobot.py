@@ -148,7 +148,7 @@ def test_what_an_import_does_not_know_is_left_out(data: Path, tmp_path: Path) ->
     write_episode(tmp_path / "data", unknown, states, read_video(folder / "rgb.mkv"))
     assert export(Args(tmp_path / "data", tmp_path / "out")) == (1, ["observation.state"])
     assert "observation.state" not in json.loads((tmp_path / "out/meta/info.json").read_text())["features"]
-    with pytest.raises(EpisodeError, match=r"has no video of the robot alone; leave out --robot-video"):
+    with pytest.raises(EpisodeError, match=r"has no video of the robot alone; omit --robot-video"):
         export(Args(tmp_path / "data", tmp_path / "out2", robot_video=True))
 
 

@@ -72,7 +72,7 @@ def test_drive_targets_are_commands_and_nothing_is_made_up(imported: Path) -> No
     assert np.isnan(states.joint_pos).all() and np.isnan(states.joint_vel).all() and not states.robot_mask.any()
     assert states.object_pose.shape == (made.FRAMES, 0, 7) and record.object_names == ()
     demand_known(imported, "action", "tool_pose")
-    with pytest.raises(EpisodeError, match=r"imported from RoboTwin HDF5.*does not record joint_pos, robot_mask; leave it out"):
+    with pytest.raises(EpisodeError, match=r"imported from RoboTwin HDF5.*does not record joint_pos, robot_mask; exclude it"):
         demand_known(imported, "joint_pos", "action", "robot_mask")
 
 
@@ -165,7 +165,7 @@ def test_a_robot_that_moved_is_told(tmp_path: Path) -> None:
         file["endpose/left_endpose"][:, 0] += 0.05
     records, refused = import_all([tmp_path / LEGACY, moved], Args(tmp_path, tmp_path / "out"))
     assert len(records) == 1 and len(refused) == 1
-    assert "ARX-X5 stands 50 mm from where it stood" in refused[0] and "another --out" in refused[0]
+    assert "the base of ARX-X5 is 50 mm from its place" in refused[0] and "another --out" in refused[0]
 
 
 def test_end_poses_may_be_absent(tmp_path: Path) -> None:
@@ -256,7 +256,7 @@ HEAD = "observation/head_camera"
         (rewrite(f"{HEAD}/rgb", np.array([b"jpeg"] * made.FRAMES)), "frame 0, cannot be decoded; expected a JPEG"),
         (rewrite(f"{HEAD}/rgb", np.array([b"jpeg"])), "has 1 pictures; expected one for each of 5 frames"),
         (rewrite(f"{HEAD}/intrinsic_cv", np.eye(4)), "intrinsic_cv has shape"),
-        (rewrite(f"{HEAD}/extrinsic_cv", np.eye(4)), "extrinsic_cv looks away from the table"),
+        (rewrite(f"{HEAD}/extrinsic_cv", np.eye(4)), "extrinsic_cv does not see the table"),
         (rewrite(f"{HEAD}/extrinsic_cv", np.zeros((3, 4))), "extrinsic_cv holds no rotation"),
         (rewrite(f"{HEAD}/extrinsic_cv", np.arange(60.0).reshape(5, 3, 4)), "changes during the episode"),
     ],
@@ -301,7 +301,7 @@ def test_the_command_imports_what_it_can_and_names_the_rest(
     [
         ((), "no folder above it is named after a robot"),
         (("--robot", "pipper"), "did you mean 'piper'"),
-        (("--robot", "piper"), "does not lie as RoboTwin lays it out"),
+        (("--robot", "piper"), "does not follow RoboTwin's layout"),
     ],
 )
 def test_mistakes_are_told_in_a_line(

@@ -45,7 +45,7 @@ def test_both_kinds_of_motion_are_never_mixed(
     ):
         with pytest.raises(SystemExit, match="2"):
             refused()
-        assert "keep them in data sets of their own" in capsys.readouterr().err and not out.exists()
+        assert "keep them in separate data sets" in capsys.readouterr().err and not out.exists()
 
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EROFS, errno.EACCES, errno.EIO, errno.EDQUOT])

@@ -148,7 +148,7 @@ def wandering(frames: int = 12) -> np.ndarray:
 @pytest.mark.parametrize("robot", ["aloha_agilex", "franka_panda"])
 def test_tool_poses_are_forward_kinematics_of_commands(tmp_path: Path, robot: str) -> None:
     from xew.sim_warp.geometry.poses import matrix_from_pose
-    from xew.sim_warp.kinematics import joint_positions, link_matrices
+    from xew.sim_warp.kinematics.forward import joint_positions, link_matrices
     from xew.sim_warp.robots import load_urdf
 
     folder = synthetic.write_cell(tmp_path, "place_empty_cup", 0, robot, frames=5)

@@ -67,7 +67,7 @@ def test_the_examples_run_and_pasting_beats_freezing(data: Path, tmp_path: Path)
 
 
 def test_a_model_is_told_commands_only(data: Path) -> None:
-    from xew.sim_warp.kinematics import tool_pose
+    from xew.sim_warp.kinematics.forward import tool_pose
     from xew.sim_warp.robots import ROBOTS
 
     folder, record = next((f, r) for f, r in find_records(data) if r.robot == "arx_x5")

@@ -78,9 +78,7 @@ def test_own_motion_is_on_record_and_never_mixed_with_shared_motion(tmp_path: Pa
     generate(asked)
     ((folder, record),) = find_records(out)
     assert record.motion == "own" and find_problem(folder) == "", "its holds are known again in its own time"
-    with pytest.raises(
-        EpisodeError, match="holds episodes of own motion, and shared motion is asked for; choose another --out"
-    ):
+    with pytest.raises(EpisodeError, match="holds episodes of own motion, expected shared motion; choose another --out"):
         generate(replace(asked, motion="shared"))
     assert yield_table([record]).splitlines()[-1] == "motion: own 1"
     header = folder / "episode.json"
@@ -201,7 +199,7 @@ def test_a_full_disk_in_a_worker_is_one_line(
         (("--robots", "panda"), "error: unknown robot 'panda';"),
         (("--robots", "tests.sim_warp.small:CLOSE"), "is a Task; expected a RobotSpec"),
         (("--train-seeds", "-1"), "tasks, 5 robots, -1 training"),
-        (("--batch", "0"), "batches from 1"),
+        (("--batch", "0"), "a batch from 1"),
         (("--device", "gpu"), "error: --device gpu: not on this machine, which has cpu"),
     ],
 )
@@ -427,5 +425,5 @@ def test_workers_hand_over_results_and_errors() -> None:
         assert sorted(workers.run(half, [2, 4, 6])) == [1, 2, 3]
         with pytest.raises(ConfigError, match="thirteen"):
             list(workers.run(half, [13]))
-        with pytest.raises(EpisodeError, match=r"a worker process was killed.*What is done is kept"):
+        with pytest.raises(EpisodeError, match=r"a worker process was killed.*Completed work is stored"):
             list(workers.run(half, [2, 17, 4]))

@@ -190,7 +190,7 @@ def test_nothing_there_is_told_with_the_way_to_make_it(made: Path, data: Path, t
     assert code == 2 and "no episode under" in told and "python -m xew.sim_warp.generate --out" in told
     shutil.rmtree(data / folder_name(TASK) / "0000000")
     code, _, told = inspect(data, "--rerender", 1)
-    assert code == 2 and "is accepted, so there is nothing to render or draw" in told
+    assert code == 2 and "is accepted; expected at least one to render or draw" in told
     assert inspect(data, "--grid", tmp_path / "grid.png")[0] == 2 and not (tmp_path / "grid.png").exists()
     (tmp_path / "file").write_text("")
     code, _, told = inspect(made, "--pictures", tmp_path / "file")
@@ -211,7 +211,7 @@ def test_shapes_that_are_not_known_cannot_be_counted(data: Path, inspect: Inspec
     for folder, _ in read_headers(data)[0]:
         edit_header(folder, source="elsewhere")
     code, _, told = inspect(data, "--visibility")
-    assert code == 2 and "has no episode whose shapes are known" in told
+    assert code == 2 and "has no episode with known shapes" in told
 
 
 def test_what_is_seen_too_little_is_named_with_its_size() -> None:

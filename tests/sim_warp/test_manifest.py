@@ -153,7 +153,7 @@ def test_tasks_stand_in_order_of_their_names_whatever_was_made_first() -> None:
         ({"test": [3]}, "from 1000000 to 1999999, found (3,)…"),
         ({"rejected": {"../1": {"piper": "plan"}}}, "rejected seeds must be whole numbers, found '../1'"),
         ({"rejected": {"0": {"piper": "plan"}}}, "seeds ['0'] are accepted and rejected"),
-        ({"train": [True]}, "found True, expected a whole number"),
+        ({"train": [True]}, "expected int, found bool True"),
     ],
 )
 def test_the_line_says_what_is_wrong_and_what_to_do(changes: dict[str, object], told: str, tmp_path: Path) -> None:
@@ -161,4 +161,4 @@ def test_the_line_says_what_is_wrong_and_what_to_do(changes: dict[str, object], 
     path.write_text(broken(**changes))
     with pytest.raises(EpisodeError) as error:
         read_manifest(path)
-    assert told in str(error.value) and "name another file by --manifest" in str(error.value)
+    assert told in str(error.value) and "pass another file with --manifest" in str(error.value)

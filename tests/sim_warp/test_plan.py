@@ -8,8 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from xew.protocol import ARMS, FRAME_RATE
 from xew.sim_warp.embodiment.spec import RobotSpec
-from xew.sim_warp.kinematics import tool_pose
 from xew.sim_warp.kinematics.expert import POSITION_TOLERANCE, ROTATION_TOLERANCE, Commands, joint_commands
+from xew.sim_warp.kinematics.forward import tool_pose
 from xew.sim_warp.plan import GRIP_TIME, HOME, LEFT, RIGHT, TOOL_SPEED, TURN_SPEED, Timeline, ToolPath, minimum_jerk, tool
 from xew.sim_warp.production.cells import Job, measured_tools, plan_cells
 from xew.sim_warp.production.warm_up import stand_at_home

@@ -1,7 +1,6 @@
-"""Other people's data sets in and out: RoboTwin's HDF5 episodes are imported, ours are exported for LeRobot.
+"""Import and export of data sets: RoboTwin's HDF5 episodes are imported, xew's episodes are exported for LeRobot.
 
-The commands are `python -m xew.exchange.robotwin` and `python -m xew.exchange.lerobot`; both keep to the contract of
-`xew.episode` and train nothing.
+The commands are `python -m xew.exchange.robotwin` and `python -m xew.exchange.lerobot`.
 """
 
 __all__ = ["hdf5", "lerobot", "robotwin"]

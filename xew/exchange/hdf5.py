@@ -1,11 +1,8 @@
-"""Reader of RoboTwin's HDF5 files: `read_robotwin(path)` gives one episode in our conventions.
+"""Reader of RoboTwin's HDF5 files: `read_robotwin(path)` gives one episode in xew's conventions.
 
-Reads  the legacy layout (observation/, joint_action/, endpose/) and that of version 1.0 (vision/, state/)
-Writes `Recorded`
-
-Two traps of the format. Its pictures are RGB arrays that went into a JPEG encoder as if they were BGR, so that decoding with
-OpenCV gives RGB again; newer files mark their pictures as ordinary JPEGs by a comment, and those must be swapped. And its
-quaternions are w x y z.
+It reads the legacy layout (observation/, joint_action/, endpose/) and the layout of version 1.0 (vision/, state/). RoboTwin
+encodes RGB arrays as JPEG as if they were BGR: OpenCV decodes them to RGB. Newer files mark ordinary JPEGs by a comment; these
+are converted from BGR. RoboTwin's quaternions are w x y z.
 """
 
 import json
@@ -23,22 +20,22 @@ from xew.files import demand_regular, read_text
 from xew.protocol import FRAME_RATE
 
 TOOL_OFFSET = 0.12
-"""Distance of RoboTwin's end pose behind the tool center point, along the approach [m], whatever the robot."""
+"""Distance of RoboTwin's end pose behind the tool center point, along the approach [m], for all robots."""
 STEPS_PER_SECOND = 250
-"""Rate of RoboTwin's simulation [Hz]. What its files call `frequency` is the number of steps from a frame to the next: 15."""
+"""Rate of RoboTwin's simulation [Hz]. The key `frequency` of its files is the number of steps between frames: 15."""
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 """From OpenGL's camera frame (y up, z backward) to OpenCV's (y down, z forward), and back."""
 RGB_MARK = b"XPL-RGB1"
 """JPEG comment of pictures that are ordinary JPEGs."""
 LARGEST_RATIO = 2000
-"""Largest size of an array by that of the file that holds it; compression makes zeros a thousand times smaller."""
+"""Largest ratio of an array's size to its file's size; compression makes zeros a thousand times smaller."""
 TABLE_CENTER = (0.0, 0.0, 0.74)
-"""Point that a head camera sees, world frame [m]."""
+"""Point that every head camera sees, world frame [m]."""
 
 
 @dataclass(frozen=True)
 class Recorded:
-    """One episode as RoboTwin recorded it, in our units, frames and orders."""
+    """One RoboTwin episode in xew's units, frames and orders."""
 
     layout: str
     """Layout of the file: "legacy" or "1.0"."""
@@ -47,7 +44,7 @@ class Recorded:
     grippers: np.ndarray
     """[t 2] commanded, 0 closed to 1 open."""
     tool_pose: np.ndarray | None
-    """[t 2 7] measured tool center points, world [m] and quaternion x y z w; None where the file has no end poses."""
+    """[t 2 7] measured tool center points, world [m] and quaternion x y z w; None if the file has no end poses."""
     rgb: np.ndarray
     """[t h w 3] uint8, the head camera."""
     intrinsics: np.ndarray
@@ -55,14 +52,14 @@ class Recorded:
     extrinsics: np.ndarray
     """[4 4] world to camera."""
     instruction: str
-    """Instruction; empty where the file has none."""
+    """Instruction; empty if there is none."""
     frame_rate: float
-    """Frames a second."""
+    """Frames per second."""
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Names of the datasets of a layout; of arms, grippers and end poses left and right."""
+    """Names of the datasets of a layout; for arms, grippers and end poses left and right."""
 
     name: str
     arms: tuple[str, str]
@@ -92,14 +89,14 @@ MODERN = Layout(
     intrinsics="vision/cam_head/intrinsic_matrix",
     extrinsics=("vision/cam_head/extrinsics_matrix",),
 )
-"""Version 1.0; `state` is what was in force at a frame. Its `action` is the state of the next frame and adds nothing."""
+"""Version 1.0: `state` is in force at a frame; `action` is the state of the next frame and is not read."""
 
 
 def read_robotwin(path: Path) -> Recorded:
     """Read an episode of either layout.
 
     Raises:
-        EpisodeError: it is no HDF5 file, truncated, or lacks something, or something has another shape than it should.
+        EpisodeError: the file is not HDF5, truncated or incomplete, or an array has a wrong shape.
     """
     try:
         with h5py.File(demand_regular(path), "r") as file:
@@ -108,24 +105,23 @@ def read_robotwin(path: Path) -> Recorded:
             return _read(reader, MODERN if "state" in file else LEGACY)
     except EpisodeError:
         raise
-    except Exception as error:  # h5py has OSError, RuntimeError and others for damaged files
+    except Exception as error:  # h5py raises OSError, RuntimeError and others for damaged files
         raise EpisodeError(f"{path} cannot be read as HDF5 ({' '.join(str(error).split())}); copy it again.") from error
 
 
 def demand_whole(path: Path, file: h5py.File) -> None:
-    """Check that a file holds all of its data itself, before any is read.
+    """Check, before reading, that a file holds all of its data itself.
 
-    HDF5 can link to other files (external links), keep arrays in them (external storage) or put arrays together from them
-    (virtual datasets), and its library would read whatever file of this machine is named. An array of which nothing is
-    stored has any size.
+    HDF5 can refer to other files by external links, external storage and virtual datasets, and its library would open any file
+    of this machine. An array without stored data can have any size.
 
     Raises:
-        EpisodeError: it does one of these.
+        EpisodeError: the file refers to another file, or an array is larger than the file can hold.
     """
     problems: list[str] = []
     size = path.stat().st_size
 
-    def look(name: str, link: Any) -> None:
+    def check(name: str, link: Any) -> None:
         if not isinstance(link, (h5py.HardLink, h5py.SoftLink)):
             problems.append(f"{name} is a link to another file")
             return
@@ -137,9 +133,9 @@ def demand_whole(path: Path, file: h5py.File) -> None:
         elif isinstance(stored, h5py.Dataset) and stored.nbytes > LARGEST_RATIO * size:
             problems.append(f"{name} has {stored.nbytes:,} bytes, of a file of {size:,}")
 
-    file.visititems_links(look)
+    file.visititems_links(check)
     if problems:
-        raise EpisodeError(f"{path}: {problems[0]}; expected a file that holds all of its data itself. It is not read.")
+        raise EpisodeError(f"{path}: {problems[0]}; expected a file that holds all of its data itself.")
 
 
 def _read(reader: "_Reader", layout: Layout) -> Recorded:
@@ -180,7 +176,7 @@ def _read(reader: "_Reader", layout: Layout) -> Recorded:
 
 
 def tool_center(end_pose: np.ndarray) -> np.ndarray:
-    """RoboTwin's end poses [t 7] (quaternion w x y z) as tool frames [t 7] (x y z w) at the tool center point."""
+    """Tool frames [t 7] (quaternion x y z w) at the tool center point, from RoboTwin's end poses [t 7] (w x y z)."""
     w, x, y, z = end_pose[:, 3:].T
     approach = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], 1)
     return np.concatenate([end_pose[:, :3] + TOOL_OFFSET * approach, end_pose[:, [4, 5, 6, 3]]], 1)
@@ -196,7 +192,7 @@ def decode_picture(encoded: bytes) -> np.ndarray | None:
 
 
 def _center_pixels(intrinsics: np.ndarray, scale: float) -> np.ndarray:
-    """K [3 3] of pixels that count from the center of the first, as ours do; RoboTwin counts from its upper left corner."""
+    """K [3 3] with the origin at the center of the first pixel; RoboTwin's origin is its upper left corner."""
     centered = intrinsics.copy()
     centered[:2] /= scale
     centered[:2, 2] -= 0.5
@@ -204,10 +200,10 @@ def _center_pixels(intrinsics: np.ndarray, scale: float) -> np.ndarray:
 
 
 def _world_to_camera(reader: "_Reader", name: str) -> np.ndarray:
-    """World to camera [4 4] m, of a matrix that is stored in either direction, in OpenCV's or OpenGL's camera frame.
+    """World to camera [4 4] m, from a matrix of either direction, in OpenCV's or OpenGL's camera frame.
 
-    Of the four readings it is the one under which the camera hangs over the table, sees it and looks as the robot does, to +y.
-    (The head camera's inverse sees the table too, from the other side.)
+    Of the four readings, the camera must be above the table, see it, and face +y as the robot does. (The inverse of the head
+    camera's matrix sees the table too, from the other side.)
     """
     stored = reader.constant(name, None)
     if stored.shape not in ((3, 4), (4, 4)):
@@ -220,17 +216,17 @@ def _world_to_camera(reader: "_Reader", name: str) -> np.ndarray:
     for candidate in (matrix, inverse, OPENGL @ matrix, OPENGL @ inverse):
         x, y, z, _ = candidate @ [*TABLE_CENTER, 1]
         height = -candidate[:3, 2] @ candidate[:3, 3]
-        looks_ahead = candidate[2, 1] > 0
-        if height > TABLE_CENTER[2] and looks_ahead and z > 0 and max(abs(x), abs(y)) < z:
+        faces_ahead = candidate[2, 1] > 0
+        if height > TABLE_CENTER[2] and faces_ahead and z > 0 and max(abs(x), abs(y)) < z:
             return candidate
     raise reader.error(
-        f"{name} looks away from the table", "the head camera in OpenCV's frame (y down, z forward) or OpenGL's (y up)"
+        f"{name} does not see the table", "the head camera in OpenCV's frame (y down, z forward) or OpenGL's (y up)"
     )
 
 
 @dataclass(frozen=True)
 class _Reader:
-    """Takes arrays out of a file and says what is wrong with it."""
+    """Checked access to the arrays of a file."""
 
     path: Path
     file: h5py.File
@@ -245,7 +241,7 @@ class _Reader:
         return dataset
 
     def numbers(self, name: str, dimensions: int) -> np.ndarray:
-        """Finite numbers [...] float64 in so many dimensions."""
+        """Finite numbers [...] float64 of a number of dimensions."""
         stored = self.dataset(name)
         if stored.ndim != dimensions or stored.dtype.kind not in "fiu":
             raise self.error(f"{name} is {stored.dtype} of shape {stored.shape}", f"numbers in {dimensions} dimensions")
@@ -255,14 +251,14 @@ class _Reader:
         return array
 
     def column(self, name: str) -> np.ndarray:
-        """Numbers [t] that are stored as [t] or [t 1]."""
+        """Numbers [t], stored as [t] or [t 1]."""
         array = self.numbers(name, 2 if self.dataset(name).ndim == 2 else 1)
         if array.ndim != 1 and array.shape[1:] != (1,):
             raise self.error(f"{name} has shape {array.shape}", "[frames 1]: a gripper of one number")
         return array.reshape(len(array))
 
     def frame_rate(self, name: str) -> float:
-        """Frames a second, of the number of the simulation's steps between two; the usual one where the file has none."""
+        """Frames per second, from the stored number of simulation steps between frames; default: FRAME_RATE."""
         if name not in self.file:
             return FRAME_RATE
         steps = self.numbers(name, self.dataset(name).ndim).reshape(-1)
@@ -271,7 +267,7 @@ class _Reader:
         return STEPS_PER_SECOND / float(steps[0])
 
     def constant(self, name: str, shape: tuple[int, ...] | None) -> np.ndarray:
-        """A matrix [r c] that is stored once or, the same, for every frame."""
+        """A matrix [r c], stored once or equal for every frame."""
         stored = self.numbers(name, self.dataset(name).ndim)
         first = stored[0] if stored.ndim == 3 else stored
         if stored.ndim not in (2, 3) or (shape is not None and first.shape != shape):
@@ -298,7 +294,7 @@ class _Reader:
         return np.stack(decoded)
 
     def instruction(self) -> str:
-        """The first instruction in the file, or in the file of instructions beside it."""
+        """The first instruction in the file, or in the episode's separate instruction file."""
         stored = self.file.get("instructions")
         if isinstance(stored, h5py.Dataset):
             return _first_instruction(_as_text(stored[()]))
@@ -309,7 +305,7 @@ class _Reader:
 
 
 def text_beside(episode: Path, name: str) -> str:
-    """A text file of the folder that holds RoboTwin's data/ with the episodes; empty where there is none."""
+    """Text of a file next to RoboTwin's data/ folder, empty if there is none."""
     path = episode.absolute().parent.parent / name
     try:
         return read_text(path) if path.exists() else ""

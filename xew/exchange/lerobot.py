@@ -1,14 +1,14 @@
-"""Export accepted episodes as a LeRobotDataset (codebase v3.0), which LeRobot and what is built on it read.
+"""Export accepted episodes as a LeRobotDataset (codebase v3.0).
 
 Reads  DATA: a data set
-Writes DIR: meta/ (info, tasks, episodes, statistics), data/ (parquet, many episodes a file) and videos/ (H.264 in mp4, one)
+Writes DIR: meta/ (info, tasks, episodes, statistics), data/ (parquet, many episodes per file), videos/ (H.264 in mp4, one each)
 
     action, observation.state     the canonical 16 numbers, commanded and measured
     observation.tool_pose         14 numbers: left and right tool, x y z [m] and quaternion x y z w, world
     observation.images.head       the head camera; observation.images.robot with --robot-video: the robot alone by its commands
     next.done, next.success       true at the last frame
-The table of episodes says of each its robot, task, seed and kind of motion (columns xew/…). Features that an imported episode
-lacks are left out of the whole set. Frames are 0.06 s apart, so `fps` is 50 / 3; video is lossy, all else is exact.
+The table of episodes has each episode's robot, task, seed and kind of motion (columns xew/…). A feature that an imported
+episode lacks is omitted for the whole set. `fps` is 50 / 3. Video is lossy; all other data are exact.
 
 Command: python -m xew.exchange.lerobot DATA --out DIR [--robots … --tasks … --split train --robot-video]
 """
@@ -36,12 +36,12 @@ from xew.protocol import expand_robots
 
 VERSION = "v3.0"
 RATE = Fraction(50, 3)
-"""Frames a second."""
+"""Frames per second."""
 FILES_PER_CHUNK = 1000
 LARGEST_DATA, LARGEST_VIDEO = 100, 200
-"""Sizes at which LeRobot's own tools close a file and begin the next [MB]; here a video has one episode."""
+"""Sizes at which LeRobot's tools begin the next file [MB]; here a video file has one episode."""
 ENCODER = {"crf": "16", "g": "2", "bf": "0", "preset": "veryfast"}
-"""Options of x264: every other frame is a key frame, for fast reading of single frames."""
+"""Options of x264; every second frame is a key frame, for fast access to single frames."""
 QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 AXES = [f"{side}_{axis}" for side in ("left", "right") for axis in ("x", "y", "z", "qx", "qy", "qz", "qw")]
 JOINTS = [f"{side}_{name}" for side in ("left", "right") for name in (*(f"joint{number}" for number in range(1, 8)), "gripper")]
@@ -69,15 +69,14 @@ class Args:
     tasks: tuple[str, ...] = ()
     """Tasks to export; default: all in the data."""
     split: Literal["train", "validation", "test"] | None = None
-    """Family of seeds; default: all. Export the training seeds if you train on the set and grade on our test
-    seeds."""
+    """Family of seeds; default: all. Export the training seeds to train on the set and grade on xew's test seeds."""
     robot_video: bool = False
-    """Export the video of the robot alone too, as observation.images.robot."""
+    """Also export the video of the robot alone, as observation.images.robot."""
 
 
 @dataclass(frozen=True)
 class Place:
-    """Number of a file of its kind, as LeRobot counts chunks and files."""
+    """Numbers of a file's chunk and of the file in it, as LeRobot counts them."""
 
     chunk: int = 0
     file: int = 0
@@ -90,14 +89,14 @@ class Place:
 
 
 def export(args: Args) -> tuple[int, list[str]]:
-    """Write a LeRobotDataset; returns how many episodes it has, and the features left out because one does not know them.
+    """Write a LeRobotDataset; returns the number of episodes and the omitted features.
 
     Raises:
-        EpisodeError: there is nothing to export, the folder exists or cannot be written, or another process writes it.
+        EpisodeError: nothing is selected, the folder exists or cannot be written, or another process writes it.
     """
     with hold_lock(args.out):
         if args.out.exists():
-            raise EpisodeError(f"{args.out} exists; choose another --out, or remove it first.")
+            raise EpisodeError(f"{args.out} exists; choose another --out or remove it.")
         chosen = _select_episodes(args)
         vectors, videos = _select_features(args, chosen)
         try:
@@ -109,14 +108,14 @@ def export(args: Args) -> tuple[int, list[str]]:
 
 
 def _select_features(args: Args, chosen: Sequence[tuple[Path, Record]]) -> tuple[Vectors, dict[str, str]]:
-    """Vectors that all episodes know, and file names of videos by feature."""
+    """Vectors that all episodes have, and file names of videos by feature."""
     vectors = {
         feature: entry for feature, entry in VECTORS.items() if not any(entry[0] in record.unknown for _, record in chosen)
     }
     videos = {"observation.images.head": "rgb.mkv"}
     if args.robot_video:
         if without := [folder for folder, record in chosen if "robot" not in record.hashes]:
-            raise EpisodeError(f"{without[0]} has no video of the robot alone; leave out --robot-video.")
+            raise EpisodeError(f"{without[0]} has no video of the robot alone; omit --robot-video.")
         videos["observation.images.robot"] = "robot.mkv"
     return vectors, videos
 
@@ -131,7 +130,7 @@ def _select_episodes(args: Args) -> list[tuple[Path, Record]]:
             raise EpisodeError(f"{flag} {', '.join(missing)}: not in {args.data}; it has {', '.join(sorted(known))}.")
     chosen = dataset.select(robots=robots or None, tasks=args.tasks or None, split=args.split)
     if not chosen:
-        raise EpisodeError(f"{args.data} has no episode of these robots, tasks and seeds; name fewer.")
+        raise EpisodeError(f"{args.data} has no episode of these robots, tasks and seeds; relax the selection.")
     return chosen
 
 
@@ -197,7 +196,7 @@ def _arrow(columns: dict[str, np.ndarray]) -> pa.Table:
 
 
 class _Tables:
-    """Parquet files of rows, closed as they fill: one that is not closed cannot be read."""
+    """Parquet files of rows; each is closed when it is full, and the last at the end of a `with` block."""
 
     def __init__(self, root: Path) -> None:
         self.root, self.place = root, Place()
@@ -212,7 +211,7 @@ class _Tables:
             self.writer.close()
 
     def add(self, columns: dict[str, np.ndarray]) -> Place:
-        """Append the rows of an episode, arrays [t n] or [t] by feature; returns the file that has them."""
+        """Append the rows of an episode, arrays [t n] or [t] by feature; returns their file."""
         rows = _arrow(columns)
         if self.writer is not None and self.bytes + rows.nbytes > LARGEST_DATA * 1e6:
             self.writer.close()
@@ -227,13 +226,13 @@ class _Tables:
 
 
 class _VideoFiles:
-    """H.264 files of one episode each, so a tool that splits or filters the set copies files and encodes nothing."""
+    """H.264 files of one episode each: tools that split or filter the set copy files without encoding."""
 
     def __init__(self, root: Path) -> None:
         self.root, self.next = root, Place()
 
     def add(self, video: np.ndarray) -> dict[str, Any]:
-        """Write the video of an episode [t h w 3] uint8 RGB; returns the columns that say where it is."""
+        """Write the video of an episode [t h w 3] uint8 RGB; returns the columns that locate it."""
         place, self.next = self.next, self.next.next_place()
         path = place.path(self.root, "mp4")
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -256,15 +255,15 @@ class _VideoFiles:
 
 @dataclass
 class _Totals:
-    """What the statistics of the whole set need."""
+    """Totals for the statistics of the whole set."""
 
     columns: dict[str, list[np.ndarray]] = field(default_factory=dict)
     colors: dict[str, np.ndarray] = field(default_factory=dict)
-    """Numbers of how often each value occurs in the videos [3 256]."""
+    """Counts of each value in the videos [3 256]."""
     frames: int = 0
 
     def add(self, columns: dict[str, np.ndarray]) -> None:
-        """Take in the numbers of an episode, [t n] or [t] by feature."""
+        """Add the numbers of an episode, [t n] or [t] by feature."""
         for name, values in columns.items():
             self.columns.setdefault(name, []).append(values)
         self.frames += len(columns["index"])
@@ -283,7 +282,7 @@ def _statistics(values: np.ndarray) -> dict[str, list[Any]]:
 
 
 def color_counts(video: np.ndarray) -> np.ndarray:
-    """[3 256] how often each value occurs in red, green and blue of uint8 [t h w 3]."""
+    """[3 256] counts of each value in red, green and blue of uint8 [t h w 3]."""
     return np.stack([np.bincount(video[..., channel].reshape(-1), minlength=256) for channel in range(3)])
 
 
@@ -359,7 +358,7 @@ def main() -> None:
     count, left_out = export(args)
     print(f"{count} episodes in {args.out}")
     for feature in left_out:
-        print(f"left out: {feature}, which imported episodes lack")
+        print(f"omitted: {feature}, which imported episodes lack")
 
 
 if __name__ == "__main__":

@@ -1,12 +1,12 @@
-"""Import RoboTwin 2.0 episodes: HDF5 files of the legacy layout or of version 1.0 become episodes of ours.
+"""Import RoboTwin 2.0 episodes from HDF5 files of the legacy layout or of version 1.0.
 
-Reads  SRC: a file, or a folder in which all episode*.hdf5 are found
+Reads  SRC: a file, or a folder with episode*.hdf5 at any depth
 Writes <out>/<task>/<seed>/<robot>/, see xew/episode.py, and <out>/robots/<robot>/
 
-What RoboTwin records as joint positions are drive targets: they become `action`, the command in force at each frame; measured
-joints stay unknown, as do objects, contacts and the robot's mask (`Record.unknown`). End poses are measured, and become tool
-poses. Where the joints move one of our robots as the end poses say, the robot is kept with the bases that follow from them,
-and the robot-only video and the keypoints are rendered with it, posed by the commands; else there are none.
+RoboTwin's joint positions are drive targets and become `action`, the command in force at each frame. Measured joints, objects,
+contacts and the robot's mask stay unknown (`Record.unknown`). End poses are measured and become tool poses. If the joints of
+one of xew's robots reach the end poses, that robot is stored with the fitted bases, and the robot-only video and keypoints are
+rendered with it, posed by the commands. Otherwise there are none.
 
 Command: python -m xew.exchange.robotwin SRC --out data [--robot arx_x5 --task NAME]
 """
@@ -26,10 +26,11 @@ from xew.episode import EpisodeError, Record, States, episode_folder, read_recor
 from xew.exchange.hdf5 import Recorded, read_robotwin, text_beside
 from xew.files import hold_lock
 from xew.names import check_name
-from xew.protocol import ACTION_DIM, ARMS, FRAME_RATE, OWN_MOTION
+from xew.protocol import ACTION_DIM, FRAME_RATE, OWN_MOTION
 from xew.sim_warp.devices.workers import quiet_warp
 from xew.sim_warp.geometry.camera import Camera
 from xew.sim_warp.geometry.poses import matrix_from_pose, pose_from_matrix
+from xew.sim_warp.kinematics.expert import canonical_commands
 from xew.sim_warp.kinematics.forward import tool_matrix
 from xew.sim_warp.rendering.observe import Recording, keypoint_names, observe
 from xew.sim_warp.rendering.streams import command_renders, default_renderer
@@ -43,11 +44,11 @@ EMBODIMENTS = {
     "franka-panda": "franka_panda",
     "piper": "piper",
 }
-"""RoboTwin's names of robots, and ours."""
+"""RoboTwin's names of robots, and xew's."""
 TOOL_DISTANCE = {"aloha_agilex": 0.12, "arx_x5": 0.12, "ur5_wsg": 0.11, "franka_panda": 0.08, "piper": 0.12}
 """Distance from the link that carries the tool to RoboTwin's tool center point [m] (gripper_bias of its embodiments)."""
 FIT_POSITION, FIT_ROTATION = 0.01, 0.05
-"""Largest median distance [m] and angle [rad] between end poses and those of a robot's joints at which it is that robot."""
+"""Largest median distance [m] and angle [rad] between end poses and a robot's tool poses at which it is that robot."""
 SAME_PLACE = 0.003
 """Largest distance between the bases of two episodes of one robot [m]."""
 UNKNOWN = ("joint_pos", "joint_vel", "object_pose", "object_joint", "contact", "penetration", "keypoint_visible", "robot_mask")
@@ -64,30 +65,29 @@ class Args:
     robot: str | None = None
     """Registry key, module:NAME or path of a robot; default: by the names of the folders."""
     task: str | None = None
-    """Name of the task; default: that of the folder two above the one that holds the file, as RoboTwin lays them out."""
+    """Name of the task; default: the name of the third folder above the file, as in RoboTwin's layout."""
 
 
 def find_episodes(source: Path) -> list[Path]:
     """All RoboTwin episodes at or below a path. Raises EpisodeError if there is none."""
     paths = [source] if source.is_file() else sorted(source.rglob("episode*.hdf5"))
     if not paths:
-        raise EpisodeError(f"no episode*.hdf5 at {source}; name a RoboTwin episode or a folder of them.")
+        raise EpisodeError(f"no episode*.hdf5 at {source}; pass a RoboTwin episode or a folder of them.")
     return paths
 
 
 def import_episode(path: Path, args: Args) -> Record:
     """Read one file and write one episode; an existing episode is skipped.
 
-    RoboTwin counts the seeds of each configuration from 0, so files of two (clean and randomized) may claim one episode: the
-    second is refused.
+    RoboTwin counts the seeds of each configuration from 0: files of two configurations may have the same task, seed and robot.
 
     Raises:
-        EpisodeError, ConfigError: the file or the robot cannot be used.
+        EpisodeError, ConfigError: the file or the robot cannot be used, or another recording has its task, seed and robot.
     """
     recorded = read_robotwin(path)
     name, robot = _robot(path, recorded, args)
     task, seed = check_name(args.task or _task(path), f"task of {path}"), _seed(path)
-    action = canonical_action(recorded)
+    action = canonical_commands(recorded.arms, recorded.grippers).astype(np.float32)
     folder = episode_folder(args.out, task, seed, name)
     if (folder / "episode.json").is_file():
         if not np.array_equal(read_states(folder).action, action):
@@ -96,10 +96,10 @@ def import_episode(path: Path, args: Args) -> Record:
                 "into another --out."
             )
         return read_record(folder)
-    for beside in folder.parent.glob("[!.]*/episode.json"):
-        if not read_record(beside.parent).source:
+    for neighbor in folder.parent.glob("[!.]*/episode.json"):
+        if not read_record(neighbor.parent).source:
             raise EpisodeError(
-                f"{path}: {beside.parent} was simulated here; RoboTwin's seed {seed} is another scene. Import it as another "
+                f"{path}: {neighbor.parent} was simulated here; RoboTwin's seed {seed} is another scene. Import it as another "
                 "--task or into another --out."
             )
     states, names, video = _build_states(robot, action, recorded)
@@ -107,35 +107,26 @@ def import_episode(path: Path, args: Args) -> Record:
         task=task,
         seed=seed,
         robot=name,
-        success=True,  # RoboTwin keeps an episode only if its own test of success holds at the end
+        success=True,  # RoboTwin stores successful episodes only
         instruction=recorded.instruction,
         frame_count=len(action),
         frame_rate=recorded.frame_rate,
         keypoint_names=names,
         versions={"xew": xew.__version__},
         source=f"{SOURCE} ({recorded.layout})",
-        motion=OWN_MOTION,  # RoboTwin plans for each robot by itself
+        motion=OWN_MOTION,  # RoboTwin plans for each robot separately
         unknown=UNKNOWN if recorded.tool_pose is not None else (*UNKNOWN, "tool_pose"),
     )
     return read_record(write_episode(args.out, record, states, recorded.rgb, video))
 
 
-def canonical_action(recorded: Recorded) -> np.ndarray:
-    """[t 16] float32 commands in force at each frame."""
-    action = np.zeros((len(recorded.arms), ACTION_DIM), np.float32)
-    for arm, (joints, gripper) in enumerate(ARMS):
-        action[:, joints.start : joints.start + recorded.arms.shape[2]] = recorded.arms[:, arm]
-        action[:, gripper] = recorded.grippers[:, arm]
-    return action
-
-
 def fit_bases(robot: RobotSpec, recorded: Recorded) -> RobotSpec | None:
-    """The robot with the bases and tool frames from which the recorded joints bring its tools to the recorded end poses.
+    """The robot with the bases and tool frames at which the recorded joints reach the recorded end poses.
 
-    Targets run ahead of what is measured, so the bases are the median over the episode.
+    Targets run ahead of measurements: the bases are the median over the episode.
 
     Returns:
-        None where there are no end poses or the robot is another.
+        None if there are no end poses or they do not fit the robot.
     """
     if recorded.tool_pose is None or recorded.arms.shape[2] != robot.arm_joint_count:
         return None
@@ -160,13 +151,13 @@ def fit_bases(robot: RobotSpec, recorded: Recorded) -> RobotSpec | None:
 
 
 def _middle_pose(poses: np.ndarray) -> np.ndarray:
-    """The pose [7] of poses [t 7] that is nearest to their median."""
+    """The pose [7] among poses [t 7] nearest to their median."""
     aligned = np.concatenate([poses[:, :3], poses[:, 3:] * np.where(poses[:, 3:] @ poses[0, 3:] < 0, -1, 1)[:, None]], 1)
     return poses[int(np.argmin(np.linalg.norm(aligned - np.median(aligned, axis=0), axis=1)))]
 
 
 def _robot(path: Path, recorded: Recorded, args: Args) -> tuple[str, RobotSpec | None]:
-    """The name under which the episode is stored, and the robot that it is rendered with, if it is known."""
+    """The name under which the episode is stored, and the robot for rendering, if it is known."""
     named = args.robot or _embodiment(path)
     robot = get_robot(named, args.out)
     if is_path(named) and (tool := read_draft(find_description(Path(named))).arms[0].tool_pose):
@@ -179,34 +170,34 @@ def _robot(path: Path, recorded: Recorded, args: Args) -> tuple[str, RobotSpec |
     bases = [np.array([arm.root_pose[:3] for arm in spec.arms]) for spec in (placed, earlier)]
     if (moved := np.abs(bases[0] - bases[1]).max()) > SAME_PLACE:
         raise EpisodeError(
-            f"{path}: {robot.title} stands {1000 * moved:.0f} mm from where it stood in the episodes before; import episodes "
-            "of another base distance into another --out."
+            f"{path}: the base of {robot.title} is {1000 * moved:.0f} mm from its place in earlier episodes; import episodes "
+            "with another base distance into another --out."
         )
     return key, earlier
 
 
 def _embodiment(path: Path) -> str:
-    """Our key of the robot that a folder above the file is named after."""
+    """The key of the robot that a folder above the file is named after."""
     for part in reversed(path.absolute().parts[:-1]):
         for theirs, ours in EMBODIMENTS.items():
             if theirs.lower().replace("-", "_") in part.lower().replace("-", "_"):
                 return ours
-    raise ConfigError(f"{path}: no folder above it is named after a robot ({', '.join(EMBODIMENTS)}); name one with --robot.")
+    raise ConfigError(f"{path}: no folder above it is named after a robot ({', '.join(EMBODIMENTS)}); pass --robot.")
 
 
 def _task(path: Path) -> str:
     """data/<task>/<config>/data/episode0.hdf5, and data/<config>/<task>/<robot>/data/episode_0000000.hdf5."""
     parts = path.absolute().parts
     if len(parts) < 4 or parts[-2] != "data":
-        raise ConfigError(f"{path} does not lie as RoboTwin lays it out (<task>/…/data/episode*.hdf5); name its --task.")
+        raise ConfigError(f"{path} does not follow RoboTwin's layout (<task>/…/data/episode*.hdf5); pass --task.")
     return parts[-4]
 
 
 def _seed(path: Path) -> int:
-    """The scene's seed by RoboTwin's seed.txt, or the episode's number where there is none."""
+    """The scene's seed by RoboTwin's seed.txt, or the episode's number without that file."""
     digits = "".join(filter(str.isdecimal, path.stem))
     if not digits:
-        raise EpisodeError(f"{path}: the file's name has no number; RoboTwin calls them episode0.hdf5 and so on.")
+        raise EpisodeError(f"{path}: the file's name has no number; expected a name such as episode0.hdf5.")
     seeds = text_beside(path, "seed.txt").split()
     number = int(digits)
     return int(seeds[number]) if number < len(seeds) and seeds[number].isdecimal() and len(seeds[number]) < 20 else number
@@ -215,7 +206,7 @@ def _seed(path: Path) -> int:
 def _build_states(
     robot: RobotSpec | None, action: np.ndarray, recorded: Recorded
 ) -> tuple[States, tuple[str, ...], np.ndarray | None]:
-    """States, names of keypoints and the robot-only video [t h w 3] of commands [t 16], as far as they can be known."""
+    """States, names of keypoints and the robot-only video [t h w 3] of commands [t 16], as far as they are known."""
     frames, height, width = recorded.rgb.shape[:3]
     camera = Camera(recorded.intrinsics, recorded.extrinsics)
     names: tuple[str, ...] = ()
@@ -245,15 +236,15 @@ def _build_states(
 
 
 def import_all(paths: Sequence[Path], args: Args) -> tuple[list[Record], list[str]]:
-    """Import files one by one; the headers of what was imported, and what is wrong with the others."""
+    """Import files one by one; the headers of the imported files, and an error message for each other file."""
     records: list[Record] = []
-    refused: list[str] = []
+    problems: list[str] = []
     for path in tqdm(paths, desc="importing", unit="episode"):
         try:
             records.append(import_episode(path, args))
         except (EpisodeError, ConfigError) as error:
-            refused.append(str(error))
-    return records, refused
+            problems.append(str(error))
+    return records, problems
 
 
 @user_errors
@@ -263,17 +254,15 @@ def main() -> None:
     if args.robot:
         get_robot(args.robot, args.out)  # a mistake is reported once, not for every file
     with hold_lock(args.out):
-        records, refused = import_all(find_episodes(args.source), args)
+        records, problems = import_all(find_episodes(args.source), args)
     rendered = sum("robot" in record.hashes for record in records)
     print(f"{len(records)} episodes under {args.out}, {rendered} with the robot's own kinematics")
     rates = sorted({1000 / record.frame_rate for record in records})
     if any(abs(1000 / FRAME_RATE - time) > 0.1 for time in rates):
         times = " and ".join(f"{time:.0f}" for time in rates)
-        print(
-            f"their frames are {times} ms apart, those of this project's own data {1000 / FRAME_RATE:.0f} ms: train on one kind"
-        )
-    if refused:
-        raise EpisodeError("\n".join([*refused, f"{len(refused)} files were not imported."]))
+        print(f"their frames are {times} ms apart, in simulated data {1000 / FRAME_RATE:.0f} ms: do not mix them in training")
+    if problems:
+        raise EpisodeError("\n".join([*problems, f"{len(problems)} files were not imported."]))
 
 
 if __name__ == "__main__":

@@ -1,8 +1,7 @@
 """Simulation: (task, seed) to episodes, by scenes, experts, physics and rendering on Newton and Warp. It never imports JAX.
 
-At its root lie the commands (`generate`, `inspect`), the seeds that are known (`manifest`), and what a task is written with
-(`scene`, `objects`, `plan`, `stage`). One level down lies the way of a seed: `tasks`, `production`, `physics`, `rendering`, and
-what these build on.
+The root has the commands (`generate`, `inspect`), the known seeds (`manifest`), and the modules that tasks use (`scene`,
+`objects`, `plan`, `stage`). The packages make episodes: `tasks`, `production`, `physics`, `rendering`, and their foundations.
 """
 
 __all__ = [

@@ -3,9 +3,8 @@
 Reads  the registries of tasks and robots
 Writes <out>/<task>/<seed>/<robot>/, see xew/episode.py; one line per task and robot at the end
 
-Seeds are tried in order until enough of them are accepted, that is, until all robots have succeeded on them; those that
-the manifest (manifest.py) knows to fail are left out. What is on disk is not made again: stop the command at any time, give
-it again, and the result is the same.
+Seeds are tried in order until enough are accepted: a seed is accepted if all robots succeed on it. Seeds that fail according to
+the manifest (manifest.py) are skipped. Episodes on disk are not made again: an interrupted command can be run again.
 
 Command: python -m xew.sim_warp.generate --batch 256 [--tasks … --robots … --train-seeds 50 --test-seeds 20
     --validation-seeds 4 --motion shared --out data]
@@ -37,7 +36,7 @@ from xew.sim_warp.robots import ROBOTS, RobotSpec, adopt_robots, get_robot, is_p
 from xew.sim_warp.tasks import TASKS, get_task
 
 Timed = tuple[list[Record], float]
-"""Headers of one job's cells, and the seconds that workers spent on it."""
+"""Headers of one job's cells, and the workers' time for them [s]."""
 
 
 @dataclass(frozen=True)
@@ -47,42 +46,41 @@ class Args:
     tasks: tuple[str, ...] = tuple(TASKS)
     """Keys of the registry, or module:NAME."""
     robots: tuple[str, ...] = tuple(ROBOTS)
-    """Keys of the registry, bodies (body:17, body:0-63), module:NAME, or paths of your own (docs/add_a_robot.md)."""
+    """Keys of the registry, bodies (body:17, body:0-63), module:NAME, or paths (docs/add_a_robot.md)."""
     train_seeds: int = TRAIN_SEEDS_PER_TASK
-    """Number of accepted training seeds a task, or with --unpaired a task and robot."""
+    """Number of accepted training seeds per task, or with --unpaired per task and robot."""
     test_seeds: int = TEST_SEEDS_PER_TASK
-    """Number of accepted test seeds, likewise; they count from where no training seed comes."""
+    """Number of accepted test seeds per task; they never overlap with training seeds."""
     validation_seeds: int = 0
-    """Number of accepted validation seeds, likewise: for samples while models train, for calibration and whatever is tuned."""
+    """Number of accepted validation seeds per task: for samples during training, calibration and tuning."""
     test_robots: tuple[str, ...] = ()
-    """Robots of the test seeds, where they are others than --robots, which then are those of all other seeds."""
+    """Robots of the test seeds; default: --robots."""
     out: Path = Path("data")
     batch: int = 256
-    """Number of worlds that a GPU steps together. A CPU steps each by itself, as many at a time as there are workers."""
+    """Number of worlds that a GPU steps together. On a CPU each worker steps one world at a time."""
     workers: int | None = None
-    """Number of processes; by default one a core, on GPUs one for two cores, as far as their memory has room."""
+    """Number of processes; default: one per core, on GPUs one per two cores within their memory."""
     device: Annotated[str | None, tyro.conf.arg(metavar="cpu|cuda:0")] = None
-    """Default: all GPUs of the kind of the first, which workers share, else the CPU."""
+    """Device; default: all GPUs of the first one's kind, shared by the workers, else the CPU."""
     physics: Literal["cpu"] | None = None
-    """Plan and step physics on the CPU, which repeats to the bit where a GPU does not, and use the GPU for pictures alone, so
-    that machines of a kind make the same data set (docs/performance.md). Takes about a second of a core an episode."""
+    """Run planning and physics on the CPU, rendering on the GPU. CPU physics is bit-repeatable, GPU physics is not: equal
+    machines make equal data sets (docs/performance.md). Takes about one core-second per episode."""
     unpaired: bool = False
-    """Each robot gets seeds of its own, and no scene waits for another robot to succeed: more scenes for a codec to learn
-    from, nothing to compare robots by."""
+    """Use different seeds for each robot. Gives more scenes for codec training, but no paired comparison of robots."""
     motion: Literal["shared", "own"] = "shared"
-    """shared: all robots follow one tool path on one clock, so that the body alone differs. own: each robot goes between the
-    task's waypoints by a path, in a time and from a rest posture of its own."""
+    """Kind of motion. shared: all robots follow one tool path on one clock; only the body differs. own: each robot moves
+    between the task's waypoints on its own path, in its own time and from its own rest posture."""
     states_only: bool = False
-    """Store no videos, only states and all hashes; `python -m xew.sim_warp.inspect DATA --render` makes them on demand."""
+    """Store states and all hashes without videos; `python -m xew.sim_warp.inspect DATA --render` makes videos on demand."""
     manifest: Path = PACKAGED
-    """File that says which seeds are known to fail."""
+    """File with the seeds that are known to fail."""
     search: bool = False
-    """Try every seed, whatever the manifest says."""
+    """Try every seed, ignoring the manifest."""
 
 
 @contextmanager
 def start_workers(args: Args, robots: Mapping[str, RobotSpec]) -> Iterator[Callable[[Sequence[Job]], Iterator[Timed]]]:
-    """Start worker processes with all kernels compiled; gives what makes the scenes of jobs in them."""
+    """Start worker processes with compiled kernels; yields the function that makes the scenes of jobs."""
     devices = find_devices(args.device)
     physics = find_device(args.physics) if args.physics else devices[0]
     production = Production(args.out, robots, physics.is_cuda, args.batch, not args.states_only)
@@ -93,7 +91,7 @@ def start_workers(args: Args, robots: Mapping[str, RobotSpec]) -> Iterator[Calla
 
 
 def generate(args: Args) -> list[Family]:
-    """Make what is missing; returns all families with their records."""
+    """Make missing episodes; returns all families with their records."""
     _check(args)
     robots = _find_robots(args.robots, args.out)
     tested = _find_robots(args.test_robots, args.out) or robots
@@ -120,7 +118,7 @@ def generate(args: Args) -> list[Family]:
 
 
 def plan_seeds(args: Args, robots: Mapping[str, Sequence[str]], manifest: Manifest) -> list[Family]:
-    """The families of seeds that are asked for; arguments as of `plan_families`."""
+    """The requested families of seeds; arguments as of `plan_families`."""
     wanted = {"train": args.train_seeds, "validation": args.validation_seeds, "test": args.test_seeds}
     return plan_families(args.tasks, wanted, robots, manifest, motion=args.motion, unpaired=args.unpaired)
 
@@ -130,25 +128,25 @@ def _check(args: Args) -> None:
     for task in args.tasks:
         get_task(task)
     if args.workers is not None and args.workers < 1:
-        raise EpisodeError(f"--workers is {args.workers}; expected at least 1, or none for as many as there are cores.")
+        raise EpisodeError(f"--workers is {args.workers}; expected at least 1; omit it for the default.")
     if not args.tasks or not args.robots or min(args.train_seeds, args.test_seeds) < 0 or args.batch < 1:
         raise EpisodeError(
-            f"nothing to make of {len(args.tasks)} tasks, {len(args.robots)} robots, {args.train_seeds} training and "
-            f"{args.test_seeds} test seeds in batches of {args.batch}; name tasks and robots, seeds from 0 and batches from 1."
+            f"found {len(args.tasks)} tasks, {len(args.robots)} robots, {args.train_seeds} training and {args.test_seeds} test "
+            f"seeds and --batch {args.batch}; expected at least one task and robot, seeds from 0 and a batch from 1."
         )
     if args.unpaired and max(args.train_seeds, args.test_seeds) > MOST_UNPAIRED:
         raise EpisodeError(
-            f"{max(args.train_seeds, args.test_seeds)} seeds a robot are asked for by --unpaired, which has room for"
-            f" {MOST_UNPAIRED}; ask for fewer, or name more robots."
+            f"--unpaired with {max(args.train_seeds, args.test_seeds)} seeds per robot; expected at most {MOST_UNPAIRED}: ask "
+            "for fewer, or name more robots."
         )
 
 
 def _find_robots(asked: Sequence[str], out: Path) -> dict[str, RobotSpec]:
-    """Robots by the names under which episodes know them, each found once; those at paths are kept beside the data.
+    """Robots by their names in episodes; robots at paths are copied into the data set.
 
     Raises:
-        ConfigError: there is no such robot, or it cannot be used; then nothing has been written.
-        EpisodeError: the folder cannot be written to.
+        ConfigError: there is no such robot, or it cannot be used; nothing has been written.
+        EpisodeError: the folder cannot be written.
     """
     names = expand_robots(asked)
     known = {name: get_robot(name, out) for name in names if not is_path(name)}
@@ -157,7 +155,7 @@ def _find_robots(asked: Sequence[str], out: Path) -> dict[str, RobotSpec]:
 
 
 def _prepare_folder(out: Path) -> None:
-    """Make the folder, without what a stopped run left half-written. Raises EpisodeError where it cannot be written to."""
+    """Make the folder and remove incomplete episodes. Raises EpisodeError if it cannot be written."""
     try:
         out.mkdir(parents=True, exist_ok=True)
         remove_left_overs(out)
@@ -168,22 +166,22 @@ def _prepare_folder(out: Path) -> None:
 
 
 def _read_existing(families: list[Family], args: Args) -> None:
-    """Add what is on disk to the families.
+    """Add the cells on disk to the families.
 
     Raises:
-        EpisodeError: a header is damaged or in another's place, an episode of these tasks was imported, videos are wanted
-            that were left out, or episodes are of the other kind of motion.
+        EpisodeError: a header is damaged or in a wrong folder, an episode of these tasks was imported, or the data set has
+            no videos or another kind of motion.
     """
     out = args.out
     for folder, record in find_records(out):
         if not record.videos and not args.states_only:
             raise EpisodeError(
-                f"{out} was made with --states-only; go on so, make its videos by `python -m xew.sim_warp.inspect {out} "
+                f"{out} was made with --states-only; pass it again, make the videos by `python -m xew.sim_warp.inspect {out} "
                 "--render`, or choose another --out."
             )
         if record.motion != args.motion:
             raise EpisodeError(
-                f"{out} holds episodes of {record.motion} motion, and {args.motion} motion is asked for; choose another --out."
+                f"{out} holds episodes of {record.motion} motion, expected {args.motion} motion; choose another --out."
             )
         for family in families:
             if args.unpaired and record.robot not in family.robots:
@@ -194,7 +192,7 @@ def _read_existing(families: list[Family], args: Args) -> None:
                     raise EpisodeError(f"{folder} holds {record.task}/{record.seed}/{record.robot}; move or delete it.")
                 if record.source:
                     raise EpisodeError(
-                        f"{folder} was imported ({record.source}): its seed is another scene than that of {record.task} here. "
+                        f"{folder} was imported ({record.source}): its seed is not the scene of {record.task} here. "
                         "Choose another --out."
                     )
                 family.add(record)
@@ -203,7 +201,7 @@ def _read_existing(families: list[Family], args: Args) -> None:
 def _print_speed(frames: Counter[str], spent: dict[str, float]) -> None:
     for task, seconds in spent.items():
         print(
-            f"{task}: {frames[task]} frames in {seconds:.1f} process-seconds, {frames[task] / seconds:.1f} frames/s a process"
+            f"{task}: {frames[task]} frames in {seconds:.1f} process-seconds, {frames[task] / seconds:.1f} frames/s per process"
         )
 
 

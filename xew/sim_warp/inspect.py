@@ -1,9 +1,9 @@
-"""The command that looks into a data set: yields, hashes, contact sheets and strips.
+"""Inspect a data set: yields, hashes, contact sheets, strips and an offline page.
 
 Reads  <data>/<task>/<seed>/<robot>/
-Writes a table to the terminal and, where asked, pictures: a sheet a task (start, middle and end of every robot) and a strip
-       an episode (eight frames of the scene over eight of the robot alone); a grid of all tasks and robots; or a page
-       on which the robots' videos run side by side, with overlays and predictions (`inspection/explorer.py`)
+Writes a table to the terminal and, with options, pictures: a sheet per seed (start, middle and end of every robot) and a strip
+       per episode (eight frames of the scene over eight of the robot alone); a grid of all tasks and robots; or a page
+       with the robots' synchronized videos, overlays and predictions (`inspection/explorer.py`)
 
 Command: python -m xew.sim_warp.inspect data [--verify] [--visibility] [--rerender 5] [--render] [--pictures sheets]
          [--grid grid.png] [--page explorer [--scenes open_laptop stack_bowls_two/0] [--rollouts rollouts/fixed]]
@@ -30,36 +30,36 @@ from xew.sim_warp.production.surfaces import read_visibility
 
 @dataclass(frozen=True)
 class Args:
-    """What to look at."""
+    """What to inspect."""
 
     data: Annotated[Path, tyro.conf.Positional]
     verify: bool = False
-    """Read everything and compare with the recorded hashes, and the motions with what is plausible."""
+    """Compare all files with the recorded hashes, and check motions for plausibility."""
     visibility: bool = False
-    """Print in how many frames the camera sees enough points on the surfaces of each robot and of what moves. Points that
-    `xew.metrics.evaluate` has kept beside the data are not rendered again."""
+    """Print in how many frames the camera sees enough surface points of each robot and each moving object. Points that
+    `xew.metrics.evaluate` has stored for the data set are not rendered again."""
     rerender: int = 0
     """Number of episodes to render again from their states and compare with the recorded hashes."""
     render: bool = False
-    """Make the videos of episodes that were generated with --states-only, and store them."""
+    """Make and store the videos of episodes that were generated with --states-only."""
     pictures: Path | None = None
-    """Folder for contact sheets and strips; none are drawn without it."""
+    """Folder for contact sheets and strips."""
     seeds: int = 2
-    """Number of seeds of each task that are drawn."""
+    """Number of seeds per task for --pictures."""
     grid: Path | None = None
-    """PNG file for one picture of all tasks and robots at work: the first accepted seed of each task."""
+    """PNG file for one picture of all tasks and robots: the first accepted seed of each task."""
     page: Path | None = None
     """Folder for an offline page that plays the robots' videos side by side; open its index.html."""
     scenes: tuple[str, ...] = ()
-    """Scenes that the page shows, each TASK or TASK/SEED; all tasks without."""
+    """Scenes on the page, each TASK or TASK/SEED; default: all tasks."""
     most: int = 6
     """Largest number of scenes on the page: the first seed of every task, then the second."""
     rollouts: tuple[Path, ...] = ()
-    """Trees of predicted videos that the page shows beside the true ones; only scenes that have some are shown."""
+    """Trees of predicted videos for the page, which then shows only scenes with predictions."""
     flow: bool = True
-    """Render optical flow for the page, which takes some seconds an episode on a CPU."""
+    """Render optical flow for the page; takes some seconds per episode on a CPU."""
     trust: tuple[str, ...] = ()
-    """Modules of your own tasks and robots, such as my_lab.tasks, that the data may name."""
+    """Modules of custom tasks and robots, such as my_lab.tasks, that the data may name."""
 
 
 @user_errors
@@ -78,7 +78,7 @@ def main() -> None:
     if damaged:
         raise EpisodeError("\n".join([*damaged, f"{len(damaged)} damaged."]))
     if not pictured and (args.visibility or args.rerender or args.render or args.pictures or args.grid or args.page):
-        raise EpisodeError(f"no seed under {args.data} is accepted, so there is nothing to render or draw.")
+        raise EpisodeError(f"no seed under {args.data} is accepted; expected at least one to render or draw.")
     if args.visibility:
         show_visibility([folder for folder, _ in pictured], args)
     if args.rerender:
@@ -97,19 +97,19 @@ def main() -> None:
 
 
 def show_visibility(folders: list[Path], args: Args) -> None:
-    """Print how much of robots and of moving objects the camera sees."""
-    kept = args.data.absolute().with_name(f"{args.data.absolute().name}-surfaces")
-    found = read_visibility(folders, kept if kept.is_dir() else None)
-    if not found:
+    """Print the visibility of robots and moving objects."""
+    store = args.data.absolute().with_name(f"{args.data.absolute().name}-surfaces")
+    visibility = read_visibility(folders, store if store.is_dir() else None)
+    if not visibility:
         raise EpisodeError(
-            f"{args.data} has no episode whose shapes are known, so nothing can be counted: all are imported, or of tasks, "
-            "scenes or robots that are not here."
+            f"{args.data} has no episode with known shapes: all are imported, or of tasks, scenes or robots that this xew does "
+            "not have."
         )
-    print(visibility_section(found))
+    print(visibility_section(visibility))
 
 
 def make_page(cells: list[tuple[Path, Record]], args: Args) -> None:
-    """Write the explorer's page of some scenes, and say where it is and what it leaves out."""
+    """Write the explorer's page of some scenes, and print its path."""
     assert args.page is not None
     if args.most < 1:
         raise EpisodeError(f"--most is {args.most}, expected at least 1 scene.")
@@ -117,12 +117,12 @@ def make_page(cells: list[tuple[Path, Record]], args: Args) -> None:
     scenes, left_out = choose_scenes(cells, args.scenes, args.most, predictions)
     write_page(Page(f"Episodes of {args.data.absolute().name}", scenes, left_out, predictions, args.flow), args.page)
     size = sum(file.stat().st_size for file in args.page.rglob("*") if file.is_file())
-    told = f"; {left_out} left out (--scenes, --most)" if left_out else ""
-    print(f"{args.page / 'index.html'}: {len(scenes)} scene{'s' * (len(scenes) != 1)}, {size / 1e6:.1f} MB{told}")
+    omitted = f"; {left_out} omitted (--scenes, --most)" if left_out else ""
+    print(f"{args.page / 'index.html'}: {len(scenes)} scene{'s' * (len(scenes) != 1)}, {size / 1e6:.1f} MB{omitted}")
 
 
 def read_headers(data: Path) -> tuple[list[tuple[Path, Record]], list[str]]:
-    """All cells whose headers can be read, and what is wrong with the others. Raises EpisodeError if there is no cell."""
+    """All cells with readable headers, and an error message for each other. Raises EpisodeError if there is no cell."""
     damaged: list[str] = []
     cells = list(read_dataset(data, damaged).cells)
     if not cells and not damaged:

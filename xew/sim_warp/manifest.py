@@ -1,18 +1,13 @@
-"""The manifest: seeds that are known to fail, found once in physics, so `generate` does not try them.
+"""The manifest: seeds that are known to fail, which `generate` skips.
 
-Reads  seeds.json in this folder, or a file of the same form (lab/seeds/manifest.py makes one)
-
-A seed in the manifest is not a promise: where physics differs a little (another GPU) one may fail, and generate goes on
-to seeds that have not been tried.
+lab/seeds/manifest.py makes seeds.json. On another GPU an accepted seed may fail; generate then continues with further seeds.
 """
 
 from collections.abc import Collection
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
-import cattrs
-
+from xew.config import ConfigError, parse
 from xew.episode import EpisodeError
 from xew.files import read_json
 from xew.names import check_name
@@ -23,7 +18,7 @@ PACKAGED = Path(__file__).with_name("seeds.json")
 
 @dataclass(frozen=True)
 class TaskSeeds:
-    """What is known of one task's seeds."""
+    """Known seeds of one task."""
 
     train: tuple[int, ...]
     """Training seeds on which every robot of the manifest succeeded, ascending."""
@@ -35,7 +30,7 @@ class TaskSeeds:
 
 @dataclass(frozen=True)
 class Manifest:
-    """Seeds by task, and what they were found with."""
+    """Seeds by task, with the robots, device and versions of the search."""
 
     robots: tuple[str, ...] = ()
     device: str = ""
@@ -49,41 +44,18 @@ class Manifest:
 
 
 def read_manifest(path: Path = PACKAGED) -> Manifest:
-    """A manifest from its file.
-
-    Raises:
-        EpisodeError: it is not there or not of this form; the message says where.
-    """
+    """Read a manifest. Raises EpisodeError if the file is missing or invalid."""
     try:
-        return _check(_converter().structure(_demand_object(read_json(Path(path))), Manifest))
-    except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError, cattrs.BaseValidationError) as error:
+        return _check(parse(Manifest, read_json(Path(path)), "its content"))
+    except (OSError, ValueError, ConfigError) as error:
+        reason = "; ".join(str(error).splitlines())
         raise EpisodeError(
-            f"{path} is no manifest of seeds ({error}); name another file by --manifest, or leave it out"
+            f"{path} is no manifest of seeds ({reason}); pass another file with --manifest, or omit it."
         ) from error
-    except cattrs.ForbiddenExtraKeysError as error:
-        raise EpisodeError(f"{path} is no manifest of seeds: unknown keys {sorted(error.extra_fields)}") from error
-
-
-def _converter() -> cattrs.Converter:
-    converter = cattrs.Converter(forbid_extra_keys=True, detailed_validation=False)
-    converter.register_structure_hook(int, lambda value, _: _demand_whole(value))
-    return converter
-
-
-def _demand_whole(value: Any) -> int:
-    if type(value) is not int:
-        raise ValueError(f"found {value!r}, expected a whole number")
-    return value
-
-
-def _demand_object(value: Any) -> dict[str, Any]:
-    if not isinstance(value, dict):
-        raise ValueError(f"found {type(value).__name__}, expected an object with tasks")
-    return value
 
 
 def _check(manifest: Manifest) -> Manifest:
-    """The same manifest. Raises ValueError for names that could lead out of a folder and for seeds that are none."""
+    """The same manifest. Raises ValueError for invalid names and seeds."""
     for task, seeds in manifest.tasks.items():
         try:
             for name, what in [(task, "task"), *((robot, "robot") for failed in seeds.rejected.values() for robot in failed)]:

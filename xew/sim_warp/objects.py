@@ -1,8 +1,6 @@
-"""The things on the table: what they look like and the convex pieces that they collide with.
+"""Basic shapes of objects: visible meshes and convex collision pieces.
 
-Each function returns a `Shape` in the object's own frame: z up, origin at the center of the bottom face, so that an
-object stands on the table when its origin is at table height. Sizes follow RoboTwin 2.0's objects, brought down to
-what a parallel gripper of 80 mm can hold (graspable widths at most 65 mm).
+Each function returns a `Shape` in the object's frame: z up, origin at the center of the bottom face.
 """
 
 from dataclasses import dataclass
@@ -13,9 +11,9 @@ from xew.sim_warp.geometry import meshes
 from xew.sim_warp.geometry.meshes import Color, Mesh
 
 WALL_SEGMENTS = 6
-"""Number of convex wedges round the wall of a hollow object: few enough that a finger pad lies on the flat of one."""
+"""Number of convex wedges round the wall of a hollow object; each is flat and wide enough for a finger pad."""
 FOOT = 0.0005
-"""Gap between the wall's wedges and the floor [m], so that a vessel stands on its floor alone."""
+"""Gap between the wall's wedges and the table [m]: a vessel stands on its floor alone."""
 
 PALETTE: dict[str, Color] = {
     "red": (200, 45, 40),
@@ -31,11 +29,11 @@ PALETTE: dict[str, Color] = {
 
 @dataclass(frozen=True)
 class Shape:
-    """A rigid piece: looks, and what it collides with."""
+    """A rigid piece: a visible mesh and collision hulls."""
 
     mesh: Mesh
     hulls: tuple[np.ndarray, ...] = ()
-    """Convex pieces, each [k 3] float32 points in the same frame; none for what is only seen."""
+    """Convex pieces, each [k 3] float32 points in the same frame; none for decorations."""
 
 
 def merge(*shapes: Shape) -> Shape:
@@ -61,7 +59,7 @@ def block(size: tuple[float, float, float], color: Color) -> Shape:
 
 
 def prism(radius: float, length: float, color: Color, end_color: Color | None = None, sides: int = 12) -> Shape:
-    """A rod along x that rests on one of its flat sides; `radius` [m] is that of its inscribed circle."""
+    """A rod along x on one of its flat sides; `radius` [m] is the radius of its inscribed circle."""
     angle = (np.arange(sides) + 0.5) * 2 * np.pi / sides - np.pi / 2
     ring = radius / np.cos(np.pi / sides) * np.stack([np.cos(angle), np.sin(angle)], -1)
     points = np.concatenate([np.column_stack([np.full(sides, x), ring]) for x in (-length / 2, length / 2)])
@@ -106,7 +104,7 @@ def _wall_hulls(outer: np.ndarray, inner: np.ndarray) -> list[np.ndarray]:
         turns = [np.array([np.cos(a), np.sin(a)]) for a in (angle - half, angle + half)]
         for low in range(len(outer) - 1):
             corners = [outer[low], outer[low + 1], inner[low], inner[low + 1]]
-            # The chord of a wedge lies inside its arc: reach out so that its middle has the outline's radius.
+            # The middle of a wedge's chord has the outline's radius.
             points = [[*(radius / np.cos(half) * turn), max(z, FOOT)] for radius, z in corners for turn in turns]
             hulls.append(np.array(points, np.float32))
     return hulls

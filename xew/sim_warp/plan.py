@@ -1,7 +1,4 @@
-"""Plans of experts: waypoints of both tool frames on a common clock. A plan knows no robot.
-
-Reads  a Scene (through a task's `plan` function)
-Writes `Timeline`, and by `Timeline.path` both tools' poses and grippers at every stored frame
+"""Plans of experts: waypoints of both tool frames on a common clock, independent of the robot.
 
 The tool frame: x is the approach direction (out of the hand), y the axis along which the fingers open.
 """
@@ -20,7 +17,7 @@ Point = Sequence[float] | np.ndarray
 TOOL_SPEED = 0.16
 """Mean speed of a tool between two waypoints [m/s]; a minimum-jerk move peaks at 1.875 times its mean."""
 TURN_SPEED = 0.45
-"""Mean turning speed of a tool [rad/s]; a move takes the time of its way and of its turn together."""
+"""Mean turning speed of a tool [rad/s]; a move takes the sum of its translation and rotation times."""
 SHORTEST_MOVE = 0.42
 """Least time of a move [s]."""
 GRIP_TIME = 0.48
@@ -35,16 +32,21 @@ class Tool:
     """[3] m, world frame."""
     rotation: Rotation
 
+    @property
+    def pose(self) -> np.ndarray:
+        """[7] position x y z [m] and quaternion x y z w."""
+        return np.concatenate([self.position, self.rotation.as_quat()])
+
     def moved(self, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> "Tool":
         """The tool shifted along world axes [m]."""
         return Tool(self.position + np.array([x, y, z]), self.rotation)
 
     def backed(self, distance: float) -> "Tool":
-        """The tool drawn back against the approach direction by a distance [m]."""
+        """The tool moved back along the approach direction by a distance [m]."""
         return Tool(self.position - distance * self.rotation.apply([1, 0, 0]), self.rotation)
 
     def carried(self, start: Point, goal: Point, turn: float = 0.0) -> "Tool":
-        """The hand after what it holds has moved from `start` to `goal` [3] m and turned about the world's z [rad]."""
+        """The hand after the held object has moved from `start` to `goal` [3] m and turned about the world's z [rad]."""
         turned = Rotation.from_euler("z", turn)
         return Tool(np.asarray(goal) + turned.apply(self.position - np.asarray(start)), turned * self.rotation)
 
@@ -54,8 +56,8 @@ def tool(position: Point, yaw: float = 0.0, tilt: float = 0.0, roll: float = 0.0
 
     Args:
         position: [3] m, world.
-        yaw: turn of the whole hand about the world's z [rad]; at 0 the fingers open along x.
-        tilt: how far the approach direction leans from straight down, at yaw 0 toward +y, away from the robot [rad].
+        yaw: turn of the hand about the world's z [rad]; at 0 the fingers open along x.
+        tilt: angle of the approach direction from straight down, at yaw 0 toward +y, away from the robot [rad].
         roll: turn about the approach direction [rad]; at 0 the fingers open horizontally.
     """
     down = Rotation.from_matrix(np.array([[0.0, -1, 0], [0, 0, 1], [-1, 0, 0]]))
@@ -64,18 +66,18 @@ def tool(position: Point, yaw: float = 0.0, tilt: float = 0.0, roll: float = 0.0
 
 
 HOME = (tool((-0.17, -0.24, 0.88), tilt=np.radians(30)), tool((0.17, -0.24, 0.88), tilt=np.radians(30)))
-"""Poses of both tools when an episode begins: every robot's home posture puts them there, in the head camera's view."""
+"""Initial poses of both tools, at every robot's home posture."""
 ASIDE = (tool((-0.28, -0.24, 0.93), tilt=np.radians(30)), tool((0.28, -0.24, 0.93), tilt=np.radians(30)))
-"""Poses where a tool waits while the other arm works alone: wide hands would meet over the middle of the table."""
+"""Poses of an idle tool while the other arm works: wide hands would collide over the middle of the table."""
 TURNED = 1e-6
-"""Angle from which a tool counts as turned [rad]."""
+"""Least angle of a turned tool [rad]."""
 ASIDE_TIME = 0.96
-"""Time for the way from home to aside [s]: in less the PiPER's wrist would turn faster than it may."""
+"""Time of a move from home to aside [s], within the speed limit of Piper's wrist."""
 
 
 @dataclass(frozen=True)
 class Hold:
-    """A stretch of time in which an arm should be touching an object."""
+    """A time span in which an arm should touch an object."""
 
     arm: int
     name: str
@@ -86,18 +88,18 @@ class Hold:
 
 @dataclass(frozen=True)
 class Segment:
-    """One arm along waypoints, evenly spaced in progress."""
+    """A move of one arm along waypoints that are evenly spaced in progress."""
 
     start_time: float
     """Begin [s]."""
     end_time: float
     waypoints: tuple[Tool, ...]
     is_curve: bool = False
-    """Must the tool stay on the line through the waypoints, whoever moves it?"""
+    """Whether every robot's tool must follow the line through the waypoints."""
 
     @property
     def is_straight(self) -> bool:
-        """Does the task need the tool on this line: a curve, or a move without a turn, as approaches and lifts are?"""
+        """Whether the task needs the tool on this line: a curve, or a move without a turn."""
         turn = (self.waypoints[0].rotation.inv() * self.waypoints[-1].rotation).magnitude()
         return self.is_curve or bool(turn < TURNED)
 
@@ -132,7 +134,7 @@ class ToolPath:
 
 @dataclass
 class Timeline:
-    """Moves, grips and waits in order, as a task writes them; at time 0 both arms are home with open grippers."""
+    """Moves, grips and waits of a task in order; at time 0 both arms are home with open grippers."""
 
     time: float = 0.0
     """Time now [s]."""
@@ -146,7 +148,7 @@ class Timeline:
     holds: list[Hold] = field(default_factory=list)
 
     def move(self, goals: dict[int, Tool], at_least: float = 0.0) -> None:
-        """Move one or both tools straight, starting and arriving together after `at_least` so many seconds."""
+        """Move one or both tools straight, starting and arriving together, in at least `at_least` [s]."""
         end = self.time + max(at_least, *(_duration(self.at[arm], goal) for arm, goal in goals.items()))
         for arm, goal in goals.items():
             self.segments[arm].append(Segment(self.time, end, (self.at[arm], goal)))
@@ -154,7 +156,7 @@ class Timeline:
         self.time = end
 
     def follow(self, arm: int, goals: list[Tool], seconds: float) -> None:
-        """Move one tool through waypoints without stopping: a curve, such as the arc of a lid's edge."""
+        """Move one tool through waypoints without stopping, for example along the arc of a lid's edge."""
         self.segments[arm].append(Segment(self.time, self.time + seconds, (self.at[arm], *goals), is_curve=True))
         self.at[arm] = goals[-1]
         self.time += seconds
@@ -171,7 +173,7 @@ class Timeline:
         self.time += seconds
 
     def hold(self, arm: int, name: str) -> None:
-        """Say that `arm` should have touched the object `name` from its last grip until now."""
+        """Record that `arm` should touch the object `name` from its last grip until now."""
         self.holds.append(Hold(arm, name, self.grips[arm][-1][0], self.time))
 
     def path(self) -> ToolPath:
@@ -185,7 +187,7 @@ class Timeline:
 
     @property
     def steps(self) -> list[dict[int, Segment]]:
-        """The moves in order, each as the segments of the arms that have a part in it, which begin and end together."""
+        """The moves in order, each as the segments of the moving arms, which begin and end together."""
         by_start: dict[float, dict[int, Segment]] = {}
         for arm in (LEFT, RIGHT):
             for segment in self.segments[arm]:
@@ -206,14 +208,14 @@ def _duration(start: Tool, end: Tool) -> float:
 
 
 def minimum_jerk(share: np.ndarray) -> np.ndarray:
-    """Progress [t] from 0 to 1 that starts and ends at rest without jerk, at shares of the time [t] from 0 to 1."""
+    """Progress [t] from 0 to 1 of a minimum-jerk move, at shares of its time [t] from 0 to 1."""
     share = np.clip(share, 0, 1)
     return np.clip(share**3 * (10 - 15 * share + 6 * share**2), 0, 1)
 
 
 def _sample(home: Tool, segments: list[Segment], times: np.ndarray) -> np.ndarray:
     """[t 7] pose of one tool; it stands still between segments."""
-    pose = np.tile(np.concatenate([home.position, home.rotation.as_quat()]), (len(times), 1))
+    pose = np.tile(home.pose, (len(times), 1))
     for segment in segments:
         now = times >= segment.start_time
         progress = minimum_jerk((times[now] - segment.start_time) / (segment.end_time - segment.start_time))

@@ -1,8 +1,4 @@
-"""Scenes: what stands on the table for a (task, seed). A scene knows no robot.
-
-Reads  nothing but a counter-based random stream
-Writes `Scene`: objects with poses, masses, hinges; the same bytes for every robot
-"""
+"""Scenes: the objects on the table for a (task, seed), from a counter-based random stream; the same for every robot."""
 
 import difflib
 import hashlib
@@ -22,10 +18,10 @@ Point = Sequence[float] | np.ndarray
 
 @dataclass(frozen=True)
 class Hinge:
-    """A lid on a revolute joint whose other side is the object's own, fixed body."""
+    """A lid on a revolute joint of a fixed object."""
 
     lid: Shape
-    """Shape of the lid in the object's frame, as it lies at angle 0."""
+    """Shape of the lid in the object's frame at angle 0."""
     mass: float
     """Mass of the lid [kg]."""
     anchor: tuple[float, float, float]
@@ -35,36 +31,36 @@ class Hinge:
     """Least angle [rad]."""
     upper: float
     start: float
-    """Angle at which the scene begins [rad]."""
+    """Initial angle [rad]."""
     friction: float
-    """Dry friction [N m]; it keeps the lid where it is left."""
+    """Dry friction [N m]; holds the lid in place."""
     damping: float
     """Viscous damping [N m s/rad]."""
     stiffness: float = 0.0
     """Stiffness of a spring [N m/rad]."""
     rest: float = 0.0
-    """Angle at which the spring is slack, inside the range or outside [rad]."""
+    """Rest angle of the spring, inside the range or outside [rad]."""
 
     def fraction(self, angle: float) -> float:
-        """How far open, 0 to 1."""
+        """Opening, 0 to 1."""
         return (angle - self.lower) / (self.upper - self.lower)
 
 
 @dataclass(frozen=True)
 class Grasp:
-    """How a hand takes an object from above: across the object's x axis, the tool over its origin."""
+    """Grasp of an object from above: across the object's x axis, the tool over its origin."""
 
     height: float
     """Height of the tool above the object's origin [m]."""
     width: float
     """Width of the object between the fingers [m]."""
     symmetry: float
-    """Angle by which the hand may turn about the object's z for an equally good grasp [rad]."""
+    """Turn of the hand about the object's z to an equally good grasp [rad]."""
 
 
 @dataclass(frozen=True)
 class SceneObject:
-    """One thing in the scene."""
+    """One object of a scene."""
 
     name: str
     shape: Shape
@@ -73,9 +69,9 @@ class SceneObject:
     """Mass [kg]; 0 means fixed to the table."""
     hinge: Hinge | None = None
     friction: float = 0.6
-    """Sliding friction coefficient; a contact has the larger of its two sides'."""
+    """Sliding friction coefficient; a contact uses the larger of two."""
     grasp: Grasp | None = None
-    """Grasp from above, for things that are taken so."""
+    """Grasp from above, if any."""
 
     @property
     def is_fixed(self) -> bool:
@@ -83,13 +79,13 @@ class SceneObject:
 
     @property
     def yaw(self) -> float:
-        """Turn about the world's z of a thing that stands upright [rad]."""
+        """Turn of an upright object about the world's z [rad]."""
         return float(2 * np.arctan2(self.pose[5], self.pose[6]))
 
 
 @dataclass(frozen=True)
 class Scene:
-    """What stands on the table when an episode begins, at rest."""
+    """The initial objects on the table, at rest."""
 
     task: str
     seed: int
@@ -97,7 +93,7 @@ class Scene:
     words: dict[str, str] = field(default_factory=dict)
     """Words of this scene (colors, sizes) for the slots of the instruction."""
     targets: dict[str, tuple[float, float]] = field(default_factory=dict)
-    """Places drawn with the scene that are no objects, such as where a row of blocks goes: x y [m]."""
+    """Target places without objects, such as of a row of blocks: x y [m]."""
 
     def index(self, name: str) -> int:
         """The number of an object. Raises ConfigError if the scene has none of that name."""
@@ -118,13 +114,13 @@ class Scene:
 
 
 def scene_rng(task: str, seed: int) -> np.random.Generator:
-    """The random stream of one scene: a function of (task, seed), not of any order in which scenes are made."""
+    """The random stream of one scene, a function of (task, seed)."""
     key = int.from_bytes(hashlib.sha256(task.encode()).digest()[:8], "little")
     return np.random.Generator(np.random.Philox(key=np.array([key, seed], np.uint64)))
 
 
 def scene_hash(scene: Scene) -> str:
-    """SHA-256 over everything that the scene is made of."""
+    """SHA-256 over the content of a scene."""
     digest = hashlib.sha256(repr((scene.task, scene.seed, sorted(scene.words.items()), sorted(scene.targets.items()))).encode())
     for thing in scene.objects:
         digest.update(repr(_plain_numbers(thing)).encode())
@@ -150,7 +146,7 @@ def upright(xy: Point, z: float, yaw: float = 0.0) -> Pose:
 def draw(
     rng: np.random.Generator, low: Sequence[float], high: Sequence[float], accept: Callable[[np.ndarray], bool]
 ) -> np.ndarray:
-    """A uniform point [d] of the box from `low` [d] to `high` [d] that `accept` takes, found by rejection."""
+    """A uniform point [d] of the box from `low` [d] to `high` [d] that `accept` accepts, by rejection sampling."""
     for _ in range(10_000):
         point = rng.uniform(low, high)
         if accept(point):

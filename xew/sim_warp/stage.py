@@ -1,7 +1,6 @@
-"""The stage: table, wall, ground and lights, which never move, as plain data for scenes, physics and renderer.
+"""The static stage: table, wall, ground and lights, as plain data for scenes, physics and renderer.
 
-Sizes and lights are RoboTwin 2.0's (`demo_clean`); meters, world frame.
-To change the place where everything happens, change these constants; to add a light, one line in LIGHTS.
+Sizes and lights are RoboTwin 2.0's (`demo_clean`), in meters and the world frame. To add a light, add a line to LIGHTS.
 """
 
 from dataclasses import dataclass
@@ -16,7 +15,7 @@ TABLE_SIZE = (1.2, 0.7, 0.05)
 """Full size of the table's plate [m]; its center is over the world's origin."""
 LEG_SIZE = 0.05
 LEG_XY = (0.55, 0.30)
-"""Distances of the four legs from the table's middle along x and y [m]."""
+"""Distances of the four legs from the table's center along x and y [m]."""
 WALL_CENTER = (0.0, 1.0, 1.5)
 WALL_SIZE = (6.0, 1.2, 3.0)
 GROUND_SIZE = 12.0
@@ -26,15 +25,15 @@ WALL_COLOR: Color = (255, 230, 230)
 GROUND_COLOR: Color = (150, 150, 150)
 
 AMBIENT = 0.5
-"""Light from everywhere, the same on all surfaces that face up; see `SKY_SHARE`."""
+"""Ambient light on surfaces that face up; see `SKY_SHARE`."""
 SKY_SHARE = 0.35
-"""Share of the ambient light that comes from above: a surface facing down misses it, so that round links look round."""
+"""Share of the ambient light from above, which surfaces facing down do not receive."""
 EXPOSURE = 0.5
-"""Factor from light to linear image value: it puts the lit white table at 0.8, below the white of the image."""
+"""Factor from light to linear image value; the lit white table is 0.8."""
 KNEE, CEILING = 0.7, 0.95
-"""Linear image values: above the knee they bend toward the ceiling, so that what is lit never reaches white."""
+"""Linear image values: above the knee they are compressed below the ceiling."""
 SPECULAR = 0.12
-"""Strength of the highlight that all surfaces share."""
+"""Strength of the highlight of all surfaces."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +53,7 @@ LIGHTS = (
     Light(1.0, (1.0, 0.0, -0.95), (-1.0, 0.0, 1.8)),
 )
 SKY = (1.0, 1.0, 1.0)
-"""Linear color where there is nothing, and of the ground of a render without the stage."""
+"""Linear color of the background."""
 SHADOW_CENTER = (0.0, -0.1, 0.85)
 """Middle of the volume that the directional light's shadow map covers [m]."""
 SHADOW_WIDTH = 1.8

@@ -86,7 +86,7 @@ def frame_parts() -> list[Part]:
 
 
 def mast_parts() -> list[Part]:
-    """The pole of the cameras, behind the head camera so that it never shows in its picture."""
+    """The pole of the cameras, behind the head camera and never in its image."""
     return [
         ("aluminum", rounded_box((-0.045, -0.02, 0), (-0.015, 0.02, 0.647), 0.003)),
         ("aluminum", rounded_box((-0.069, -0.035, -0.074), (0.025, 0.035, 0.004), 0.003)),

@@ -1,6 +1,6 @@
 """Shapes of the ARX-X5: black, its forearm white, after the link sizes of the vendor's meshes.
 
-The functions give one link each, in its frame, so that the ALOHA's arms, which are of this family, share them.
+Each function gives one link in its frame; ALOHA's arms, of the same family, share them.
 """
 
 from functools import partial

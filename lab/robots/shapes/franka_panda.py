@@ -143,7 +143,7 @@ def link6_parts() -> list[Part]:
 
 
 def link7_parts() -> list[Part]:
-    """The flange and the pilot's button head beside it."""
+    """The flange and the pilot's button head next to it."""
     flange = cylinder((0, 0, 0.052), (0, 0, 0.1068), 0.0438, bevel=0.004)
     pilot = hull(rounded_box((0.0, -0.028, 0.056), (0.082, 0.028, 0.093), 0.008, (0, 0, 0.7853982)))
     return [("gray", cylinder((0, 0, 0.049), (0, 0, 0.052), 0.041)), ("white", flange), ("shell", pilot)]

@@ -69,15 +69,15 @@ def test_motion_is_never_mixed() -> None:
 
     assert read(shared, "fixed") == read(Dataset(shared.root, own * 2), "fixed_own") == 6
     for split in ("fixed", "fixed_own"):
-        with pytest.raises(EpisodeError, match=r"episodes of shared motion \(3\) and of own motion \(3\) "):
+        with pytest.raises(EpisodeError, match=r"episodes of shared motion \(3\) and of own motion \(3\)"):
             read(mixed, split)
-    with pytest.raises(EpisodeError, match=r"episodes of shared motion \(6\) to be read, and the split is of own motion"):
+    with pytest.raises(EpisodeError, match=r"episodes of shared motion \(6\), and the split is of own motion"):
         read(shared, "fixed_own")
     replayed = EpisodeChoice((HELD_OUT_ROBOTS[0],), 1, robots)
     with pytest.raises(EpisodeError, match="own motion"):
         choose_episodes(mixed, replayed)
     records = [record for _, record in mixed.cells]
-    with pytest.raises(EpisodeError, match="do not compare; keep them in data sets of their own"):
+    with pytest.raises(EpisodeError, match="cannot be compared; keep them in separate data sets"):
         demand_one_motion(mixed.root, records)
 
 

@@ -10,7 +10,8 @@ import pytest
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from xew.sim_warp.kinematics import (
+from xew.sim_warp.kinematics.batched import BatchedKinematics
+from xew.sim_warp.kinematics.forward import (
     finger_positions,
     forward_kinematics,
     joint_positions,
@@ -18,7 +19,6 @@ from xew.sim_warp.kinematics import (
     link_poses,
     tool_pose,
 )
-from xew.sim_warp.kinematics.batched import BatchedKinematics
 from xew.sim_warp.kinematics.inverse import ArmSolver, arm_solver
 from xew.sim_warp.kinematics.reachability import work_reach
 from xew.sim_warp.plan import tool
@@ -103,66 +103,42 @@ def test_a_wrong_number_of_joints_is_named() -> None:
 def test_the_kernel_agrees_with_numpy(robot: RobotSpec, dtype: type, tolerance: float) -> None:
     urdf = load_urdf(robot.urdf)
     joint_pos = np.random.default_rng(5).uniform(-3, 3, (70, len(urdf.joint_names)))
-    batched = BatchedKinematics.of_urdf(urdf, "cpu", dtype)
+    batched = BatchedKinematics(urdf, "cpu", dtype)
     found = batched.poses(wp.array(joint_pos, dtype=dtype, device="cpu")).numpy()
     assert found.shape == (70, len(urdf.links), 7)
-    assert {link for _, link in batched.links[0]} == set(urdf.links)
+    assert set(batched.links) == set(urdf.links)
     assert (found[..., 6] >= 0).all()
     expected = link_matrices(urdf, joint_pos)
-    for number, (_, link) in enumerate(batched.links[0]):
+    for number, link in enumerate(batched.links):
         assert np.abs(found[:, number, :3] - expected[link][:, :3, 3]).max() < tolerance, link
         turned = Rotation.from_quat(found[:, number, 3:]).as_matrix()
         assert np.abs(turned - expected[link][:, :3, :3]).max() < tolerance, link
 
 
-def test_rows_of_all_robots_stand_in_one_batch() -> None:
-    """Canonical rows of five robots, mixed, are in the world where each robot alone has its links."""
-    action = np.random.default_rng(6).uniform(0, 1, (40, 16)).astype(np.float32)
-    which = np.arange(40) % len(ROBOTS)
-    batched = BatchedKinematics.of_robots(list(ROBOTS.values()), "cpu")
-    rows, robot = wp.array(action, device="cpu"), wp.array(which, dtype=int, device="cpu")
-    found = batched.poses(rows, robot)
-    for index, spec in enumerate(ROBOTS.values()):
-        own = which == index
-        copies = link_poses(spec, action[own])
-        assert len(batched.links[index]) == sum(len(copy) for copy in copies)
-        for number, (copy, link) in enumerate(batched.links[index]):
-            assert np.abs(found.numpy()[own, number] - copies[copy][link]).max() < 1e-5, (spec.key, link)
-        alone = BatchedKinematics.of_robots([spec], "cpu").poses(wp.array(action[own], device="cpu")).numpy()
-        assert np.array_equal(alone, found.numpy()[own, : alone.shape[1]]), "the same bits alone"
-    again = batched.poses(wp.array(action[::-1].copy(), device="cpu"), wp.array(which[::-1].copy(), dtype=int), out=found)
-    assert again is found
+def test_arrays_that_do_not_fit_are_named() -> None:
+    batched = BatchedKinematics(load_urdf(ROBOTS["piper"].urdf), "cpu")
+    with pytest.raises(ValueError, match=r"shape \(4, 14\), expected \(configurations, 8\)"):
+        batched.poses(wp.zeros((4, 14), device="cpu"))
+    with pytest.raises(ValueError, match=rf"out has shape \(4, 12, 7\), expected \(4, {len(batched.links)}, 7\)"):
+        batched.poses(wp.zeros((4, 8), device="cpu"), wp.empty((4, 12, 7), device="cpu"))
 
 
-def test_arrays_that_do_not_fit_the_batch_are_named() -> None:
-    batched = BatchedKinematics.of_robots(list(ROBOTS.values()), "cpu")
-    rows, robot = wp.zeros((4, 16), device="cpu"), wp.zeros(4, dtype=int, device="cpu")
-    with pytest.raises(ValueError, match=r"shape \(4, 14\), expected \(configurations, 16\)"):
-        batched.poses(wp.zeros((4, 14), device="cpu"), robot)
-    with pytest.raises(ValueError, match="there are 5 robots"):
-        batched.poses(rows)
-    with pytest.raises(ValueError, match=r"robot has shape \(3,\), expected \(4,\)"):
-        batched.poses(rows, wp.zeros(3, dtype=int, device="cpu"))
-    with pytest.raises(ValueError, match=r"out has shape \(4, 11, 7\), expected \(4, 54, 7\)"):
-        batched.poses(rows, robot, wp.empty((4, 11, 7), device="cpu"))
-
-
-def test_rows_changed_in_place_are_posed_anew() -> None:
+def test_rows_changed_in_place_are_posed_again() -> None:
     """A call with the arrays of the one before repeats its launch; other arrays do not."""
-    batched = BatchedKinematics.of_robots([ROBOTS["piper"]], "cpu")
+    batched = BatchedKinematics(load_urdf(ROBOTS["piper"].urdf), "cpu")
     rng = np.random.default_rng(7)
-    first, second = (rng.uniform(0, 1, (9, 16)).astype(np.float32) for _ in range(2))
+    first, second = (rng.uniform(0, 1, (9, 8)).astype(np.float32) for _ in range(2))
     rows = wp.array(first, device="cpu")
     out = batched.poses(rows)
     before = out.numpy().copy()
     rows.assign(second)
-    assert batched.poses(rows, out=out) is out
+    assert batched.poses(rows, out) is out
     after = out.numpy().copy()
     assert not np.array_equal(before, after)
-    other = batched.poses(wp.array(first, device="cpu"), out=out)
+    other = batched.poses(wp.array(first, device="cpu"), out)
     assert other is out and np.array_equal(out.numpy(), before)
     assert np.array_equal(batched.poses(rows).numpy(), after) and np.array_equal(out.numpy(), before)
-    assert batched.poses(wp.empty((0, 16), device="cpu")).shape == (0, len(batched.links[0]), 7)
+    assert batched.poses(wp.empty((0, 8), device="cpu")).shape == (0, len(batched.links), 7)
 
 
 @robots

@@ -8,8 +8,8 @@ import pytest
 from lab.seeds.motions import Compared, robot_table, task_table, tools_at_phase
 from xew.protocol import ARMS, FRAME_RATE, MOTIONS
 from xew.sim_warp.embodiment.spec import USUAL_ACCELERATION, RobotSpec
-from xew.sim_warp.kinematics import tool_poses
 from xew.sim_warp.kinematics.expert import POSITION_TOLERANCE, Commands, joint_commands
+from xew.sim_warp.kinematics.forward import tool_poses
 from xew.sim_warp.kinematics.own_motion import SPEED_SHARE, own_commands
 from xew.sim_warp.physics import World, simulate
 from xew.sim_warp.plan import LEFT, RIGHT, Timeline, ToolPath, tool

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from xew.sim_warp.geometry import meshes
 from xew.sim_warp.geometry.camera import HEAD_CAMERA, project
 from xew.sim_warp.geometry.poses import matrix_from_pose
-from xew.sim_warp.kinematics import forward_kinematics, joint_positions, tool_pose
+from xew.sim_warp.kinematics.forward import forward_kinematics, joint_positions, tool_pose
 from xew.sim_warp.rendering import streams
 from xew.sim_warp.rendering.bodies import body_names, keypoint_links, robot_bodies, robot_pose
 from xew.sim_warp.rendering.observe import Recording, keypoint_names, keypoint_positions, observe, scene_things

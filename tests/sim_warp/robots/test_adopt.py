@@ -91,7 +91,9 @@ def test_linked_fingers_become_a_gripper_of_one_number(tmp_path: Path) -> None:
         load_robot(path)
     (told,) = slide_fingers(tree, load_urdf(path))
     stroke = BAR * np.sin(WAY)
-    assert told.startswith(f"the hand on link6, driven by outer_a, is taken for two fingers that slide {1000 * stroke:.0f} mm")
+    assert told.startswith(
+        f"the hand on link6, driven by outer_a, is replaced by two fingers that slide {1000 * stroke:.0f} mm"
+    )
     assert "turn by 0 deg" in told
     urdf = changed(path, tree)
     arm, _ = complete_arms(RobotDraft("changed.urdf"), urdf, "here")
@@ -106,7 +108,7 @@ def test_fingers_that_do_not_meet_are_told(tmp_path: Path) -> None:
     source = placed_robot(tmp_path / "in", "small.urdf")
     write_text(source, linked_hand(0.012))
     folder = adopt.adopt(Args(source, tmp_path / "out"))
-    assert "closed, the fingers of the left hand are 12 mm apart: what is thinner cannot be held" in warning_lines(
+    assert "closed, the fingers of the left hand are 12 mm apart: thinner objects cannot be held" in warning_lines(
         load_robot(folder)
     )
 
@@ -126,7 +128,7 @@ def test_an_arm_takes_a_hand_by_name(hand: str, tmp_path: Path) -> None:
     path = write_text(tmp_path, linked_hand())
     tree = ElementTree.parse(path).getroot()
     told = graft_hand(tree, load_urdf(path), ROBOTS[hand])
-    assert told.startswith(f"the hand of {ROBOTS[hand].title} is put on link6, pointing along 1 0 0")
+    assert told.startswith(f"the hand of {ROBOTS[hand].title} is mounted on link6, pointing along 1 0 0")
     urdf = changed(path, tree)
     assert not {"finger_a", "outer_a"} & set(urdf.links)
     arm, _ = complete_arms(RobotDraft("changed.urdf"), urdf, "here")
@@ -232,7 +234,7 @@ def test_a_xacro_says_what_expands_it(tmp_path: Path, monkeypatch: pytest.Monkey
     with pytest.raises(ConfigError, match=r"is a xacro; python -m xew.sim_warp.robots.adopt arm.urdf.xacro expands it"):
         load_robot(path)
     monkeypatch.setitem(sys.modules, "xacrodoc", None)
-    with pytest.raises(ConfigError, match=r"arm.urdf.xacro is a xacro, which xacrodoc expands: python -m pip install xacrodoc"):
+    with pytest.raises(ConfigError, match=r"arm.urdf.xacro is a xacro and needs xacrodoc: python -m pip install xacrodoc"):
         read_description(path, {}, {})
 
 
@@ -289,9 +291,9 @@ def test_what_looks_wrong_is_told(tmp_path: Path) -> None:
     write_text(folder, text.replace("@", '<origin xyz="4 0 0"/><axis xyz="0 0 0"/>'))
     told = "\n".join(warning_lines(load_robot(folder)))
     for words in (
-        "it has no collision shapes: the convex hulls of what is seen collide in their place",
-        "all joints have a speed limit of 1 rad/s, which looks like a placeholder",
-        "the left hand opens 20 mm; tasks hold things of up to 70 mm",
+        "it has no collision shapes: the convex hulls of its visuals collide instead",
+        "all joints have a speed limit of 1 rad/s, probably a placeholder",
+        "the left hand opens 20 mm; tasks have objects of up to 70 mm",
         "link lamp is 4.0 m away from the root",
     ):
         assert words in told, words

@@ -120,5 +120,5 @@ def test_arrays_of_another_urdf_do_not_count(empty_cache: Path) -> None:
 def test_a_cache_that_cannot_be_written_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
-    with pytest.raises(ConfigError, match="Name another cache folder by XDG_CACHE_HOME"):
+    with pytest.raises(ConfigError, match="Set XDG_CACHE_HOME to another folder"):
         keep_files(design_body(0))

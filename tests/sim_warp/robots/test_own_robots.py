@@ -21,7 +21,7 @@ from xew.episode import array_hash
 from xew.sim_warp import generate as command
 from xew.sim_warp.embodiment import mesh_files
 from xew.sim_warp.generate import Args, generate
-from xew.sim_warp.kinematics import tool_pose
+from xew.sim_warp.kinematics.forward import tool_pose
 from xew.sim_warp.plan import HOME
 from xew.sim_warp.production.rerender import render_again
 from xew.sim_warp.rendering.render import Renderer
@@ -179,7 +179,7 @@ def test_files_of_another_machine_are_found_by_their_end(start: str, tmp_path: P
     path = write_urdf(tmp_path / "arm", {"meshes/skin.obj": f"{start}meshes/skin.obj"})
     urdf, found = load_urdf(path), path.parent / "meshes" / "skin.obj"
     assert urdf.meshes[f"{start}meshes/skin.obj"] == found
-    assert urdf.notes == (f"{start}meshes/skin.obj is not on this machine: {found} is taken for it",)
+    assert urdf.notes == (f"{start}meshes/skin.obj is not on this machine: {found} is used instead",)
 
 
 def test_textures_of_materials_color_the_triangles(tmp_path: Path) -> None:
@@ -198,7 +198,7 @@ def test_without_collision_shapes_what_is_seen_collides(tmp_path: Path) -> None:
     path.write_text(re.sub(r"<collision>.*?</collision>", "", path.read_text(), flags=re.DOTALL))
     urdf = load_urdf(path)
     assert all(len(link.collisions) == 1 and len(link.collisions[0].points) == 8 for link in urdf.links.values())
-    assert urdf.notes == ("it has no collision shapes: the convex hulls of what is seen collide in their place",)
+    assert urdf.notes == ("it has no collision shapes: the convex hulls of its visuals collide instead",)
 
 
 # --- Kept beside the data.
@@ -215,7 +215,7 @@ def test_data_keep_their_robot(embodiment: Path, tmp_path: Path, monkeypatch: py
     assert [family.accepted for family in generate(args)] == [1, 0], "again, with what is kept"
     shutil.rmtree(source)
     moved = data.rename(tmp_path / "moved")
-    with pytest.raises(ConfigError, match=r"unknown robot 'my-arm'.*a data set keeps its own in <data>/robots, list that in"):
+    with pytest.raises(ConfigError, match=r"unknown robot 'my-arm'.*For robots of a data set, list <data>/robots in"):
         get_robot("my-arm")
     folder, record = find_accepted(moved)[0]
     assert array_hash(render_again(folder, Renderer("cpu"))[0]) == record.hashes["rgb"]
@@ -255,7 +255,7 @@ def test_meshes_anywhere_are_kept(tmp_path: Path) -> None:
 def test_another_robot_of_the_same_name_is_told(embodiment: Path, tmp_path: Path) -> None:
     adopt_robots([str(embodiment)], tmp_path / "data")
     other = write_embodiment(tmp_path / "my-arm", gripper_bias=0.11)
-    with pytest.raises(ConfigError, match=r"my-arm holds another robot of that name than .*rename the folder"):
+    with pytest.raises(ConfigError, match=r"my-arm holds another robot of that name.*rename the folder"):
         adopt_robots([str(other)], tmp_path / "data")
 
 
@@ -360,7 +360,7 @@ def test_a_bad_mesh_ends_in_one_line(
 
 
 BAD_CONFIGS: list[tuple[dict[str, Any], str]] = [
-    ({"delta_matrix": None}, "missing key 'delta_matrix'; a RoboTwin embodiment has it"),
+    ({"delta_matrix": None}, "missing key 'delta_matrix'; expected the keys of a RoboTwin embodiment"),
     ({"delta_matrix": [[1, 0, 0], [0, 1, 0], [0, 0, 2]]}, "expected a rotation matrix"),
     ({"delta_matrix": [[1, 0], [0, 1]]}, "expected finite numbers of shape (3, 3)"),
     ({"gripper_bias": "far"}, "gripper_bias is 'far'; expected numbers"),
@@ -368,10 +368,10 @@ BAD_CONFIGS: list[tuple[dict[str, Any], str]] = [
     ({"gripper_name": [{"base": "grip_a", "mimic": []}]}, "expected a base joint and one mimic of"),
     ({"gripper_name": [{"base": "grip_c", "mimic": [["grip_b", 1, 0]]}]}, "small.urdf has no joint grip_c; it has arm1"),
     ({"robot_pose": [[0, 0, 0]]}, "robot_pose is [[0, 0, 0]]; expected lists of x y z and a quaternion w x y z"),
-    ({"robot_pose": [[0, -3, 0.75, 0.707, 0, 0, 0.707]]}, "m, looking to +y, both arms reach home."),
-    ({"ee_joints": ["nowhere"]}, "has no link or joint nowhere; name the one that carries the tool"),
+    ({"robot_pose": [[0, -3, 0.75, 0.707, 0, 0, 0.707]]}, "m, facing +y, both arms reach home."),
+    ({"ee_joints": ["nowhere"]}, "has no link or joint nowhere; expected the tool's link"),
     ({"arm_joints_name": [["arm1", "arm2"]]}, "have 2 and 2 joints; expected equal arms of six or seven"),
-    ({"homestate": [[0, 0]]}, "a home has 2 joints, the arm 6"),
+    ({"homestate": [[0, 0]]}, "a home has 2 joints; expected 6"),
     ({"urdf_path": "./none.urdf"}, "none.urdf does not exist; expected a URDF file"),
     ({"dual_arm": "no"}, "dual_arm is 'no'; expected a bool"),
 ]
@@ -389,8 +389,8 @@ def test_a_bad_embodiment_ends_in_one_line(
     ("content", "told"),
     [
         ({"urdff": "small.urdf"}, "unknown key 'urdff'; did you mean 'urdf'?"),
-        ({"arms": [PLACED | {"tool_pose": [0, 0, 0, 0, 0, 0, 0]}, {}]}, "is no position and unit quaternion x y z w"),
-        ({"arms": [PLACED | {"home": [0.0] * 5}, {}]}, "a home has 5 joints, the arm 6"),
+        ({"arms": [PLACED | {"tool_pose": [0, 0, 0, 0, 0, 0, 0]}, {}]}, "expected a position and a unit quaternion x y z w"),
+        ({"arms": [PLACED | {"home": [0.0] * 5}, {}]}, "a home has 5 joints; expected 6"),
         ({"arms": [PLACED, PLACED | {"joints": ["arm1", "arm2"]}]}, "the arms have 6 and 2 joints; expected equal arms"),
         ({"arms": [PLACED, {}], "joint_upper": [1.0]}, "need 6 numbers each"),
         ({"arms": [PLACED, {}], "joint_acceleration": [1.0] * 5}, "expected 6 numbers above 0"),

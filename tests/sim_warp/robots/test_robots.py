@@ -10,7 +10,7 @@ import trimesh
 from xew.config import ConfigError
 from xew.sim_warp.geometry.camera import HEAD_CAMERA, project
 from xew.sim_warp.geometry.poses import matrix_from_pose
-from xew.sim_warp.kinematics import joint_positions, link_matrices, link_poses, tool_pose
+from xew.sim_warp.kinematics.forward import joint_positions, link_matrices, link_poses, tool_pose
 from xew.sim_warp.robots import ROBOTS, RobotSpec, UrdfError, get_robot, load_urdf
 
 CHAINS = json.loads((Path(__file__).parents[1] / "data" / "chains.json").read_text())["robots"]

@@ -1,4 +1,4 @@
-"""Models of everyday things that several tasks share: looks, collision shapes, and how a hand takes them.
+"""Models of everyday objects that several tasks share: appearance, collision shapes and grasps.
 
 Each is drawn from a random stream and returned as plain geometry; scenes place them.
 """

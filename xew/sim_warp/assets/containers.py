@@ -1,9 +1,8 @@
-"""Bottles, cans, pill bottles and pots: closed containers, drawn from a random stream so that no two need be alike.
+"""Bottles, cans, pill bottles and pots: closed containers, drawn from a random stream.
 
-Each function returns a `Shape` in the object's own frame: z up, origin at the center of the bottom face, round about z.
-What collides is a column of few flat sides, whose flats look along x and y: a finger pad that meets one lies on it, and a
-bottle lying on one does not roll. The looks lie inside of it by at most 8 % of the radius. Sizes follow RoboTwin 2.0's,
-brought down to what a parallel gripper of 80 mm can hold.
+Each function returns a `Shape` in the object's frame: z up, origin at the center of the bottom face, round about z. The
+collision shape is a column of few flat sides that face along x and y: a finger pad lies flat on one, and a lying bottle does
+not roll. The visible surface is at most 8 % of the radius inside. Sizes follow RoboTwin 2.0, reduced for a gripper of 80 mm.
 """
 
 from collections.abc import Sequence
@@ -37,8 +36,7 @@ SECTIONS = 32
 SIDES = 12
 """Number of flat sides of a container that stands."""
 GRASP_BELOW_TOP = 0.014
-"""Depth of the tool below the top when a standing container is taken from above [m]: deeper, and the palm of a leaning hand
-would meet the edge."""
+"""Depth of the tool below the top of a standing container grasped from above [m]; any deeper, a leaning palm meets the edge."""
 
 Outline = Sequence[tuple[float, float]]
 """Pairs (radius, height) [m] from the bottom to the top."""
@@ -46,7 +44,7 @@ Outline = Sequence[tuple[float, float]]
 
 @dataclass(frozen=True)
 class Band:
-    """A stretch of a container's height that is painted."""
+    """A painted range of a container's height."""
 
     low: float
     """Lower end [m]."""
@@ -57,11 +55,11 @@ class Band:
 
 
 def revolve_painted(outline: Outline, color: Color, bands: Sequence[Band] = (), facing: float = 0.0) -> Mesh:
-    """A body of revolution whose stretches of height are painted.
+    """A body of revolution with painted bands.
 
     Args:
         outline: its side; every band should begin and end at one of its heights.
-        color: where there is no band.
+        color: color outside bands.
         facing: the direction of the labels' fronts about z [rad].
     """
     mesh = meshes.revolve([(0.0, outline[0][1]), *outline, (0.0, outline[-1][1])], color, SECTIONS)
@@ -78,12 +76,12 @@ def revolve_painted(outline: Outline, color: Color, bands: Sequence[Band] = (), 
 
 
 def column(radii: tuple[float, float], low: float, high: float, sides: int) -> np.ndarray:
-    """[2 sides, 3] points of a straight or tapering column about z, one of whose flats looks along x.
+    """[2 sides, 3] points of a straight or tapering column about z with one flat side facing along x.
 
     Args:
         radii: of the inscribed circles at the bottom and at the top [m].
         low, high: heights [m].
-        sides: a multiple of four, so that flats look along y too.
+        sides: a multiple of four, for flat sides along y too.
     """
     angle = (np.arange(sides) + 0.5) * 2 * np.pi / sides
     ring = np.stack([np.cos(angle), np.sin(angle)], -1) / np.cos(np.pi / sides)
@@ -126,7 +124,7 @@ def draw_color_names(rng: np.random.Generator, count: int) -> list[str]:
     return [str(name) for name in rng.permutation(sorted(objects.PALETTE))[:count]]
 
 
-# --- Standing things, taken from above.
+# --- Standing objects, grasped from above.
 
 
 def can(rng: np.random.Generator) -> tuple[Shape, str]:
@@ -187,20 +185,22 @@ def _rib(radius: float, angle: float, low: float, high: float, color: Color) -> 
 
 
 def place_standing(name: str, shape: Shape, xy: Point, yaw: float, mass: float) -> SceneObject:
-    """A can or pill bottle on the table at `xy` [2] m, turned by `yaw` [rad], to be taken by its upper end."""
+    """A can or pill bottle on the table at `xy` [2] m, turned by `yaw` [rad], with a grasp at its upper end."""
     width = 2 * float(shape.hulls[0][:, 0].max())
     grasp = Grasp(height(shape) - GRASP_BELOW_TOP, width, 2 * np.pi / SIDES)
     return SceneObject(name, shape, upright(xy, TABLE_TOP, yaw), mass, grasp=grasp)
 
 
-# --- Bottles, that lie on the table.
+# --- Bottles lying on the table.
 
 
 def place_lying(name: str, shape: Shape, xy: Point, yaw: float, mass: float) -> SceneObject:
-    """A bottle on its side with its point of balance over `xy` [2] m, its neck along +y turned by `yaw` [rad]; a hand takes it
-    there, across. In its own frame it lies on z = 0, the origin under its point of balance."""
+    """A bottle on its side with its center of mass over `xy` [2] m, its neck along +y turned by `yaw` [rad].
+
+    A hand grasps it across at the center of mass. In its frame it lies on z = 0, the origin under the center of mass.
+    """
     turn = Rotation.from_euler("x", -np.pi / 2)
-    thickness = 2 * float(shape.hulls[0][:, 1].max())  # of the flat side that looks down
+    thickness = 2 * float(shape.hulls[0][:, 1].max())  # of the flat side that faces down
     shift = np.array([0.0, 0.0, thickness / 2]) - turn.apply(center_of_mass(shape))
     hulls = tuple((turn.apply(hull) + shift).astype(np.float32) for hull in shape.hulls)
     mesh = shape.mesh.transformed(shift, (-np.pi / 2, 0, 0))
@@ -311,9 +311,9 @@ def pot(rng: np.random.Generator, radius: tuple[float, float], height: tuple[flo
     """A cooking pot with a loop handle at either end of its x axis, lidded or open, and its color's name.
 
     Args:
-        rng: for its size, colors and lid.
-        radius, height: of the body, ranges [m].
-        reach: of the handles' bars beyond the body [m].
+        rng: random stream for size, colors and lid.
+        radius, height: ranges for the body [m].
+        reach: reach of the handles' bars beyond the body [m].
     """
     body, top = (float(rng.uniform(*span)) for span in (radius, height))
     paint = draw_color_names(rng, 1)[0]
@@ -332,7 +332,7 @@ def pot(rng: np.random.Generator, radius: tuple[float, float], height: tuple[flo
 
 
 def handles(pot: Shape) -> np.ndarray:
-    """[2 3] the middles of the bars that a pot is held by, at -x and at +x [m]; the bars run along y."""
+    """[2 3] centers of a pot's handle bars, at -x and at +x [m]; the bars run along y."""
     _, left, _, _, right, _, _ = pot.hulls
     return np.stack([left.mean(0), right.mean(0)])
 
@@ -352,7 +352,7 @@ BAR = (0.014, 0.060, 0.012)
 
 
 def _loop(side: int, body: float, reach: float, height: float, color: Color) -> Shape:
-    """A bar along y that two rising struts hold before the body's wall, wide enough for a finger between."""
+    """A bar along y on two rising struts, far enough from the body's wall for a finger."""
     bar = meshes.box(BAR, color).transformed((side * reach, 0, height))
     ends = ((body - 0.003, height - 0.018), (reach, height))
     struts = [

@@ -1,9 +1,8 @@
-"""Everyday objects that several tasks share: their looks, what they collide with, and how a hand takes them from above.
+"""Everyday objects that several tasks share: appearance, collision shapes and grasps from above.
 
-Each function of `THINGS` draws one variant (form, size, color) and returns a `Thing` in the object's own frame: z up,
-origin at the center of the bottom face, the longer side along y, so that fingers that open along x take it across.
-Kinds and sizes follow RoboTwin 2.0's objects, brought down to what a parallel gripper of 80 mm can hold (graspable
-widths at most 65 mm). Looks are built from few flat pieces; what collides is one to three convex hulls.
+Each function of `THINGS` draws one variant (form, size, color) and returns a `Thing` in the object's frame: z up, origin at the
+center of the bottom face, longer side along y, grasped across x. Kinds and sizes follow RoboTwin 2.0, reduced for a gripper of
+80 mm (graspable widths at most 65 mm). The visible mesh has few flat pieces; one to three convex hulls collide.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,12 +18,12 @@ from xew.sim_warp.scene import Grasp, Point, SceneObject, upright
 from xew.sim_warp.stage import TABLE_TOP
 
 LOWEST_GRASP = 0.019
-"""Height of the tool above the table at which a leaning pad just clears it [m]: pads reach 15 mm beyond the tool."""
+"""Least height of the tool above the table for a leaning hand [m]: pads reach 15 mm beyond the tool."""
 PALM = 0.020
-"""Greatest reach of a long thing above the tool [m]: the palm of the hand with the shortest fingers leans over its end."""
+"""Largest height of a long object above the tool [m], limited by the palm of the hand with the shortest fingers."""
 HALF_TURN, QUARTER_TURN = np.pi, np.pi / 2
 SKIN = 0.0006
-"""Distance by which a printed or glued part stands out of the face that it decorates [m]."""
+"""Height of a printed or glued part above its face [m]."""
 
 DARK: Color = (45, 46, 50)
 STEEL: Color = (168, 172, 178)
@@ -36,12 +35,12 @@ MATS: dict[str, Color] = {name: COLORS[name] for name in ("red", "green", "blue"
     "cyan": (70, 190, 205),
     "magenta": (190, 60, 150),
 }
-"""Colors of the mats on which things are put, RoboTwin's eight."""
+"""RoboTwin's eight colors of mats."""
 MAT_THICKNESS = 0.001
 
 
 def mat_color(rng: np.random.Generator, words: str) -> str:
-    """A color out of `MATS` that differs from that of the thing, called `words`, that is to lie on the mat."""
+    """A color of `MATS` that is not in `words`, the name of the object for the mat."""
     return str(rng.choice([name for name in sorted(MATS) if name not in words.split()]))
 
 
@@ -64,11 +63,10 @@ class Thing:
     width: float
     """Width between the fingers [m]."""
     symmetry: float
-    """Angle by which the hand may turn about z for an equally good grasp [rad]: pi for what is long, less for what is square
-    or round."""
+    """Turn of the hand about z to an equally good grasp [rad]: pi for long objects, less for square or round ones."""
 
     def place_at(self, name: str, xy: Point, yaw: float) -> SceneObject:
-        """The thing upright on the table at `xy` [2] m, turned by `yaw` [rad]."""
+        """The object upright on the table at `xy` [2] m, turned by `yaw` [rad]."""
         grasp = Grasp(self.grasp_height, self.width, self.symmetry)
         return SceneObject(name, self.shape, upright(xy, TABLE_TOP, yaw), self.mass, grasp=grasp)
 
@@ -79,12 +77,12 @@ class Thing:
 
     @property
     def radius(self) -> float:
-        """Radius of the circle about the origin that holds the footprint [m]."""
+        """Radius of the footprint's circle about the origin [m]."""
         return footprint_radius(self.shape)
 
 
 def footprint_radius(shape: Shape) -> float:
-    """Radius of the circle about a shape's z axis that holds all that collides of it [m]."""
+    """Radius of the circle about the z axis around a shape's collision hulls [m]."""
     return float(max(np.hypot(hull[:, 0], hull[:, 1]).max() for hull in shape.hulls))
 
 
@@ -102,7 +100,7 @@ def _color(rng: np.random.Generator, names: Sequence[str]) -> tuple[str, Color]:
 
 
 def _holding_height(height: float) -> float:
-    """Height of the tool for a long thing of a height, both over its bottom [m]: as low as the palm allows."""
+    """Height of the tool above the bottom of a long object of this height [m], as low as the palm allows."""
     return max(LOWEST_GRASP, height - PALM)
 
 
@@ -120,12 +118,12 @@ def part(size: Sequence[float], at: Sequence[float], color: Color) -> Mesh:
 
 
 def print_on(length: Sequence[float], at: Sequence[float], color: Color) -> Mesh:
-    """A printed rectangle of `length` x y [m] on the horizontal face at the point `at` of it."""
+    """A printed rectangle of `length` x y [m] on a horizontal face, centered at `at`."""
     return part((*length, 2 * SKIN), at, color)
 
 
 def profile(points: Sequence[tuple[float, float]], width: float, color: Color) -> Mesh:
-    """The convex hull of an outline (y, z) [m] drawn out over `width` along x."""
+    """The convex hull of an outline (y, z) [m], extruded over `width` along x."""
     outline = np.asarray(points, float)
     return meshes.hull(
         np.concatenate([np.column_stack([np.full(len(outline), x), outline]) for x in (-width / 2, width / 2)]), color
@@ -144,11 +142,11 @@ def _loft(stations: Sequence[tuple[float, float, float]], flat: float, color: Co
 
 
 def _solid(*colliding: Mesh, seen: Sequence[Mesh] = (), unseen: Sequence[Mesh] = ()) -> Shape:
-    """Convex meshes that are seen and collide, decorations that are only seen, hulls that only collide."""
+    """A shape of convex meshes that are visible and collide, visible decorations, and invisible collision hulls."""
     return Shape(meshes.merge([*colliding, *seen]), tuple(mesh.vertices for mesh in (*colliding, *unseen)))
 
 
-# --- Things.
+# --- Objects.
 
 
 def mouse(rng: np.random.Generator) -> Thing:
@@ -178,14 +176,14 @@ class StaplerParts:
     words: str
     base: Shape
     arm: Shape
-    """Upper arm as it stands open: the gap below it is widest at the front."""
+    """Upper arm in its open position; the gap below it is widest at the front."""
     hinge: tuple[float, float, float]
     """Point of the axis, which runs along x [m]."""
     width: float
     height: float
-    """Height of the whole [m]."""
+    """Total height [m]."""
     opening: float
-    """Angle by which the arm comes down until its front meets the base [rad]."""
+    """Angle of the arm from open to closed [rad]."""
 
 
 def stapler_parts(rng: np.random.Generator) -> StaplerParts:
@@ -232,7 +230,7 @@ def stapler(rng: np.random.Generator) -> Thing:
 
 
 def bell(rng: np.random.Generator) -> Thing:
-    """A reception bell: a foot to hold it by, a dome and a button."""
+    """A reception bell: a graspable foot, a dome and a button."""
     name = str(rng.choice(["brass", "silver", "copper"]))
     metal: Color = {"brass": (212, 170, 70), "silver": (176, 181, 190), "copper": (190, 110, 75)}[name]
     radius, height = rng.uniform([0.027, 0.046], [0.031, 0.054])

@@ -1,7 +1,7 @@
-"""Devices and worker processes: which device does the work, how many processes share it, and how they wait for a GPU.
+"""Devices and worker processes: choice of the device, number of processes, and waiting for a GPU.
 
-`kernels` compiles many of Warp's kernels at once, `workers` starts processes that end with their parent, `waiting` waits
-without keeping a core busy, `newton` imports Newton when it is needed, and so that its kernels compile in half the time.
+`kernels` compiles many of Warp's kernels in parallel, `workers` starts processes that end with their parent, `waiting` waits
+without occupying a core, `newton` imports Newton on first use without adjoint kernels.
 """
 
 __all__ = ["kernels", "newton", "waiting", "workers"]

@@ -1,7 +1,7 @@
-"""Kernels of Warp: whether a device has any compiled yet, and compiling many at once.
+"""Warp's kernels: whether a device has compiled ones, and parallel compilation.
 
-Warp compiles a module of kernels when one of them is first launched, one module after another. What many launches need can be
-known before: `noted_launches` lets them pass by without launching anything, and `compile_together` compiles on all cores.
+Warp compiles a module of kernels at its first launch, one after another. `noted_launches` lists the modules that a block would
+launch, and `compile_together` compiles them on all cores.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -16,28 +16,28 @@ import warp as wp
 from xew.concurrency import usable_cores
 
 Variant = tuple[wp.Module, int]
-"""A module, and the number of threads in a block that it is compiled for."""
+"""A module and the number of threads per block for which it is compiled."""
 DEFAULT_BLOCK = 256
-"""Number of threads in a block where a launch names none."""
+"""Default number of threads per block of a launch."""
 
 
 def has_kernels(device: wp.Device) -> bool:
-    """Has Warp compiled any kernel for this kind of device on this machine?"""
+    """Whether Warp has compiled any kernel for this kind of device on this machine."""
     ending = "cubin" if device.is_cuda else "o"
     return any(Path(wp.config.kernel_cache_dir).glob(f"wp_*/*.{ending}"))
 
 
 @contextmanager
 def noted_launches() -> Iterator[dict[Variant, None]]:
-    """Note what a block would launch, in its order, and launch nothing. Bodies of loops and branches are entered once.
+    """Collect the modules that the block would launch by `wp.launch` and `wp.launch_tiled`, in order, without launching them.
 
-    It holds for code that launches by `wp.launch` and `wp.launch_tiled`, as Newton and MuJoCo Warp do.
+    Bodies of captured loops and branches are entered once.
     """
-    found: dict[Variant, None] = {}
+    variants: dict[Variant, None] = {}
 
     def note(kernel: wp.Kernel, *_: Any, block_dim: int = DEFAULT_BLOCK, **__: Any) -> None:
-        if not kernel.is_generic:  # of which there is one for each type of array, which only a launch finds out
-            found[kernel.module, block_dim] = None
+        if not kernel.is_generic:  # a generic kernel has a module per type of array, known only at launch
+            variants[kernel.module, block_dim] = None
 
     def enter(_: wp.array, *bodies: Any, stream: Any = None, **named: Any) -> None:
         named_bodies = [named.pop(name, None) for name in ("while_body", "on_true", "on_false")]
@@ -46,23 +46,21 @@ def noted_launches() -> Iterator[dict[Variant, None]]:
                 body(**named)
 
     with mock.patch.multiple(wp, launch=note, launch_tiled=note, capture_while=enter, capture_if=enter):
-        yield found
+        yield variants
 
 
 def compile_together(variants: Iterable[Variant], device: wp.Device) -> None:
-    """Compile and load kernels, on as many threads as there are cores.
-
-    Nothing depends on it: what is not among them is compiled when it is launched.
+    """Compile and load modules on all cores; modules that are not listed are compiled at launch.
 
     Args:
-        variants: what to compile, as `noted_launches` gives it.
-        device: that they will be launched on.
+        variants: modules, as `noted_launches` gives them.
+        device: device of the launches.
     """
     run_in_threads(lambda variant: wp.force_load(device, [variant[0]], variant[1], 0), variants)
 
 
 def run_in_threads(function: Callable[[Any], object], items: Iterable[Any]) -> None:
-    """Call a function with each item, on as many threads as there are cores, and raise what one of the calls raises."""
+    """Call a function with each item on one thread per core, and raise the first error."""
     with ThreadPoolExecutor(usable_cores()) as pool:
         for _ in pool.map(function, items):
             pass

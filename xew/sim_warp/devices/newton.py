@@ -1,8 +1,7 @@
-"""Newton, imported when it is first used, and with kernels that are compiled without their adjoints.
+"""Newton, imported at first use, with kernels compiled without adjoints.
 
-Import it from here. It takes seconds, which commands that hand out work to others need not wait for. Nothing here asks for
-gradients of physics: a module of Warp's takes that option over when it is made, that is, when Newton is imported; the option
-itself is then as it was, so that kernels of a user's own keep their gradients.
+Import Newton from here: it takes seconds, which commands that only distribute work avoid. xew needs no gradients of physics. A
+Warp module reads that option when it is created, at Newton's import; custom kernels of users keep their gradients.
 """
 
 import functools
@@ -16,7 +15,7 @@ __all__ = ["compile_conversion_quickly", "load_newton", "newton"]
 
 @functools.cache
 def load_newton() -> ModuleType:
-    """Import Newton now, such as in a process that others are forked from; gives the module."""
+    """Import Newton and return the module."""
     before = warp.config.enable_backward
     warp.config.enable_backward = False
     try:
@@ -29,7 +28,7 @@ def load_newton() -> ModuleType:
 
 
 class _Newton:
-    """Stands for the module, which is imported when something of it is asked for."""
+    """Stand-in for the module that imports it at the first attribute access."""
 
     def __getattr__(self, name: str) -> Any:
         return getattr(load_newton(), name)
@@ -43,10 +42,9 @@ else:
 
 @functools.cache
 def compile_conversion_quickly() -> None:
-    """Have the kernels that hand a model to MuJoCo compiled without optimizing them, for this process.
+    """Compile the kernels that convert a model for MuJoCo without optimization, in this process.
 
-    For MuJoCo's C engine, where each of them runs once a world, on a few hundred numbers, and nothing else of theirs runs:
-    compiling all of Newton's module takes 6 s instead of 20.
+    With MuJoCo's C engine each of them runs once per world on a few hundred numbers. Compilation takes 6 s instead of 20 s.
     """
     load_newton()
     warp.set_module_options({"optimization_level": 0}, "newton._src.solvers.mujoco.kernels")

@@ -1,15 +1,15 @@
-"""Waiting for a GPU without keeping a core busy. CUDA's own wait spins, and workers need the core."""
+"""Waiting for a GPU without occupying a core; CUDA's own wait spins."""
 
 import time
 
 import warp as wp
 
 PAUSE = 0.0005
-"""Time between two looks [s]."""
+"""Time between polls [s]."""
 
 
 def wait_for(device: wp.Device) -> None:
-    """Return when all that was launched on the device's stream is done; at once on a CPU, where launches wait themselves."""
+    """Wait until all launches on the device's stream have finished; on a CPU launches are synchronous."""
     if device.is_cuda:
         event = device.stream.record_event()
         while not event.is_complete:

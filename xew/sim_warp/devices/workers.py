@@ -1,12 +1,7 @@
-"""Worker processes: jobs handed to as many processes as a machine has room for.
+"""Worker processes for jobs, as many as a machine's cores and GPU memory allow.
 
-Reads  jobs and a function of a job; both travel to the workers by pickle
-Writes results, as they come
-
-On a GPU, too: what Python does there for a batch takes longer than the device, and several batches in flight keep it busy.
-Where there are several GPUs, workers have one each in turn: Warp's default device in a worker is its own.
-A worker ignores Ctrl-C (its parent decides) and leaves when its parent is killed, so that nobody writes on unwatched
-(`xew.concurrency.open_processes`).
+Jobs and results are pickled. On a GPU several batches in flight keep the device busy, because Python's part of a batch takes
+longer than the device's. Several GPUs are assigned to workers in turn, as Warp's default device.
 """
 
 import os
@@ -26,17 +21,17 @@ Job = TypeVar("Job")
 Result = TypeVar("Result")
 
 IMPORTED = ("xew.sim_warp.production.preloaded",)
-"""Modules that workers are forked with."""
+"""Modules that are imported before workers are forked."""
 MEMORY_PER_WORKER = 9e9
-"""Memory of a GPU that a worker takes [bytes]: a batch of 256 worlds, 512 frames in flight and what CUDA itself takes."""
+"""GPU memory of a worker [bytes]: a batch of 256 worlds, 512 frames in flight and CUDA's own memory."""
 FRAMES_OF_A_RENDERING_WORKER = 192
-"""Number of frames in flight of a worker that steps physics on the CPU and has the GPU draw them."""
+"""Number of frames in flight of a worker that steps physics on the CPU and renders on the GPU."""
 MEMORY_PER_RENDERING_WORKER = 3e9
-"""Memory of a GPU that such a worker takes [bytes]; 14 of them were seen with 1.8e9 each on an H100."""
+"""GPU memory of such a worker [bytes]; 14 workers on an H100 took 1.8e9 each."""
 
 
 def find_device(name: str | None) -> warp.Device:
-    """The device that a command's --device names, or the one that Warp prefers. Raises ConfigError if it is not there."""
+    """The device that --device names, or Warp's default. Raises ConfigError if it does not exist."""
     try:
         return warp.get_device(name)
     except (ValueError, RuntimeError) as error:
@@ -45,20 +40,20 @@ def find_device(name: str | None) -> warp.Device:
 
 
 def find_devices(name: str | None) -> list[warp.Device]:
-    """The devices that work is shared out to: what --device names, else all GPUs of the first one's kind, else the CPU.
+    """The devices for workers: --device, else all GPUs of the first one's kind, else the CPU. Raises as `find_device`.
 
-    A GPU of another kind, such as a small one for a display, would get as many workers as the others. Raises as `find_device`.
+    GPUs of another kind, such as a small one for a display, would get as many workers as the others.
     """
     gpus = warp.get_cuda_devices() if name is None else []
     return [gpu for gpu in gpus if gpu.name == gpus[0].name] or [find_device(name)]
 
 
 def worker_count(devices: Sequence[warp.Device], physics: warp.Device | None = None) -> int:
-    """How many processes feed some devices by default: one a core, on GPUs one for two cores if their memory has room.
+    """Default number of worker processes: one per core, or on GPUs one per two cores if their memory allows.
 
     Args:
-        devices: draw the pictures; all of a kind.
-        physics: plans and steps, if it is another device; a CPU's physics takes a core a process, and less of the GPU's memory.
+        devices: devices for rendering, all of one kind.
+        physics: another device for planning and physics, if any. CPU physics takes a core per process and less GPU memory.
     """
     cores = usable_cores()
     if not devices[0].is_cuda:
@@ -69,15 +64,15 @@ def worker_count(devices: Sequence[warp.Device], physics: warp.Device | None = N
 
 
 class Workers:
-    """Processes that are started as they are needed and stay until the end of a `with` block.
+    """Processes that start when they are needed and stay until the end of a `with` block.
 
     Args:
-        count: their number.
-        devices: that they have as Warp's default, in turn; Warp's own choice where left out.
+        count: number of processes.
+        devices: their default devices, assigned in turn; default: Warp's choice.
     """
 
     def __init__(self, count: int, devices: Sequence[warp.Device] = ()) -> None:
-        os.environ.setdefault("OMP_NUM_THREADS", "1")  # a worker is a core; more threads would wait for one another
+        os.environ.setdefault("OMP_NUM_THREADS", "1")  # one core per worker
         self._count = count
         self._pool = open_processes(count, IMPORTED, _begin_worker, own=[device.alias for device in devices])
 
@@ -88,11 +83,11 @@ class Workers:
         self._pool.shutdown(cancel_futures=True)
 
     def run(self, function: Callable[[Job], Result], jobs: Sequence[Job]) -> Iterator[Result]:
-        """Results of `function` on every job, in the order in which they are done.
+        """Results of `function` on every job, in order of completion.
 
         Args:
             function: called in a worker.
-            jobs: whoever takes results may meanwhile add to a deque, on the left what is to be done next.
+            jobs: jobs; the consumer may add to a deque during the run, on the left for the next job.
 
         Raises:
             EpisodeError: a worker was killed.
@@ -101,25 +96,24 @@ class Workers:
         under_way: set[Future[Result]] = set()
         try:
             while waiting or under_way:
-                while waiting and len(under_way) < 2 * self._count:  # one more for each, so that none waits for its next
+                while waiting and len(under_way) < 2 * self._count:  # one waiting job per worker
                     under_way.add(self._pool.submit(function, waiting.popleft()))
                 done, under_way = wait(under_way, return_when=FIRST_COMPLETED)
                 for future in done:
                     yield future.result()
         except BrokenProcessPool as error:
             raise EpisodeError(
-                "a worker process was killed, perhaps for want of memory. What is done is kept: give the command again, "
+                "a worker process was killed, perhaps for lack of memory. Completed work is stored: run the command again, "
                 "with fewer --workers if it happens again."
             ) from error
 
 
 def _begin_worker(device: str | None = None) -> None:
-    """Prepare a worker, whose device has this name for Warp."""
     quiet_warp()
     if device is not None:
         warp.set_device(device)
 
 
 def quiet_warp() -> None:
-    """For commands and their workers: no banner and no line per kernel module among the progress bars."""
+    """Silence Warp's banner and its line per kernel module."""
     warp.config.log_level = warp.LOG_ERROR

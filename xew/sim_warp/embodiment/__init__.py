@@ -1,6 +1,6 @@
-"""What a robot is: its URDF with links, joints and colored meshes, and the `RobotSpec` beside it.
+"""Descriptions of robots: URDFs with links, joints and colored meshes, and `RobotSpec`.
 
-Read from files once, checked, and never changed; which robots exist is the business of `xew.sim_warp.robots`.
+They are read once, checked, and never changed. `xew.sim_warp.robots` lists the robots.
 """
 
 __all__ = ["mesh_files", "prepared", "spec", "urdf"]

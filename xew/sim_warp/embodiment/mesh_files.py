@@ -1,10 +1,7 @@
-"""Mesh files to colored triangles: what trimesh reads, with the texture sampled to one color a triangle.
+"""Mesh files, with their materials and textures, to colored triangles by trimesh and Pillow.
 
-Reads  a mesh file and what it names in turn (materials, textures), by trimesh and Pillow
-Writes `Part`s: triangles with colors of their own, or none where the file says nothing of color
-
-The renderer shades one color a triangle, so a texture is sampled at seven points of each and averaged: patterns finer than
-the triangles are lost, everything else looks as it should.
+The renderer shades one color per triangle: a texture is sampled at seven points of each triangle and averaged. Patterns finer
+than the triangles are lost.
 """
 
 import logging
@@ -20,17 +17,17 @@ from trimesh.visual import TextureVisuals
 
 from xew.files import demand_regular
 
-logging.getLogger("trimesh").setLevel(logging.ERROR)  # it warns of each slower way that it takes, with a traceback
+logging.getLogger("trimesh").setLevel(logging.ERROR)  # its warnings have tracebacks
 LARGEST_FILE = 200e6
-"""Largest size of a mesh file [bytes]; a larger one is refused before it is read."""
+"""Largest size of a mesh file [bytes]; larger files are not read."""
 MOST_TRIANGLES = 1_000_000
-"""Largest number of triangles of a mesh file; a link of our own robots has some hundreds."""
+"""Largest number of triangles of a mesh file; a link of xew's robots has some hundreds."""
 SAMPLES = np.array([(4, 1, 1), (1, 4, 1), (1, 1, 4), (2, 2, 2), (3, 3, 0), (0, 3, 3), (3, 0, 3)]) / 6
 """Barycentric coordinates at which a texture is read."""
 
 
 class MeshError(Exception):
-    """A mesh file cannot be used; the message says why, for a sentence that begins with its name."""
+    """A mesh file cannot be used; the message completes a sentence that begins with its name."""
 
 
 @dataclass(frozen=True)
@@ -40,23 +37,23 @@ class Part:
     shape: trimesh.Trimesh
     """Mesh in the file's units and frame."""
     colors: np.ndarray | None
-    """[f 3] uint8, sRGB, or None where the file gives none."""
+    """[f 3] uint8, sRGB, or None if the file has none."""
 
 
 @dataclass(frozen=True)
 class MeshFile:
-    """All of a mesh file."""
+    """The content of a mesh file."""
 
     parts: tuple[Part, ...]
     files: tuple[Path, ...]
-    """The file itself and all that it was read from: materials, textures, buffers."""
+    """The file and the files that it names: materials, textures, buffers."""
 
 
 def read_mesh(path: Path) -> MeshFile:
     """Read a mesh of any format that trimesh knows.
 
     Raises:
-        MeshError: it is too large, unreadable or empty (triangles that are not finite do not count).
+        MeshError: it is too large, unreadable or has no finite triangle.
     """
     try:
         demand_regular(path)
@@ -80,7 +77,7 @@ def read_mesh(path: Path) -> MeshFile:
 
 
 def read_picture(path: Path) -> Image.Image:
-    """A picture of any format that Pillow reads. Raises MeshError if it cannot be read."""
+    """An image of any format that Pillow reads. Raises MeshError if it cannot be read."""
     try:
         with Image.open(demand_regular(path)) as picture:
             return picture.convert("RGB")
@@ -89,7 +86,7 @@ def read_picture(path: Path) -> Image.Image:
 
 
 def picture_colors(shape: trimesh.Trimesh, picture: Image.Image) -> np.ndarray:
-    """[f 3] uint8 colors of the triangles under a picture; its mean color where the mesh has no texture coordinates."""
+    """[f 3] uint8 colors of the triangles under an image; its mean color if the mesh has no texture coordinates."""
     uv = getattr(shape.visual, "uv", None)
     if uv is None:
         mean = np.asarray(picture, float).reshape(-1, 3).mean(0)
@@ -98,7 +95,7 @@ def picture_colors(shape: trimesh.Trimesh, picture: Image.Image) -> np.ndarray:
 
 
 def face_colors(shape: trimesh.Trimesh) -> np.ndarray | None:
-    """[f 3] uint8 colors of the triangles by the mesh's own texture, material or vertex colors; None without any."""
+    """[f 3] uint8 colors of the triangles by the mesh's texture, material or vertex colors; None without any."""
     visual = shape.visual
     if isinstance(visual, TextureVisuals):
         return _texture_colors(shape, visual)
@@ -112,9 +109,9 @@ def sample_texture(image: Any, uv: np.ndarray, faces: np.ndarray, factor: np.nda
 
     Args:
         image: a Pillow image, sRGB.
-        uv: [v 2] texture coordinates of the vertices, (0, 0) lower left; beyond 0 to 1 the texture repeats.
+        uv: [v 2] texture coordinates of the vertices, (0, 0) lower left; the texture repeats outside 0 to 1.
         faces: [f 3] vertex indices.
-        factor: [3] what the material multiplies the texture with, 0 to 1.
+        factor: [3] factor of the material, 0 to 1.
 
     Returns:
         [f 3] uint8.
@@ -139,7 +136,7 @@ def _texture_colors(shape: trimesh.Trimesh, visual: TextureVisuals) -> np.ndarra
 
 
 def _unit_color(color: np.ndarray) -> np.ndarray:
-    """The color in 0 to 1, whether it is stored so or in 0 to 255."""
+    """The color in 0 to 1; uint8 colors are in 0 to 255."""
     return color / 255 if color.dtype == np.uint8 else color.astype(float)
 
 
@@ -148,7 +145,7 @@ def _join_lines(error: Exception) -> str:
 
 
 class _Companions(Resolver):
-    """Finds what a mesh file names beside itself, `../textures/skin.png` included, and keeps a list of it."""
+    """Reads the files that a mesh file names, relative to its folder, and lists them."""
 
     def __init__(self, folder: Path, files: list[Path] | None = None) -> None:
         self.folder = folder

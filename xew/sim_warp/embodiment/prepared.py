@@ -1,9 +1,7 @@
-"""Shapes of a URDF as arrays beside it, so the next load reads and merges no mesh files.
+"""Shapes of a URDF as arrays in prepared.npz next to it: a load then reads and merges no mesh files.
 
-Reads  prepared.npz beside a URDF; valid only for the URDF whose digest it holds
-Writes the same, for folders that are written whole and never changed (the cache of procedural bodies)
-
-Plain arrays with an index in JSON, no pickles; what is read is bit for bit what the mesh files give.
+The file is valid for the URDF whose digest it holds, and is for folders that never change: the cache of procedural bodies. Its
+arrays are bit for bit what the mesh files give.
 """
 
 import hashlib
@@ -30,11 +28,11 @@ class Prepared:
     shapes: Mapping[str, tuple[Mesh | None, Hulls]]
     """Visual and collision shapes by link."""
     meshes: Mapping[str, Path]
-    """File of each mesh by the name that the URDF gives it."""
+    """File of each mesh by its name in the URDF."""
 
 
 def write_prepared(path: Path, prepared: Prepared) -> None:
-    """Write the shapes of the URDF at `path` beside it."""
+    """Write the shapes of the URDF at `path` next to it."""
     index: dict[str, tuple[bool, list[str]]] = {}
     arrays: dict[str, np.ndarray] = {}
     for link, (visual, hulls) in prepared.shapes.items():
@@ -47,7 +45,7 @@ def write_prepared(path: Path, prepared: Prepared) -> None:
 
 
 def read_prepared(path: Path) -> Prepared | None:
-    """The shapes beside the URDF at `path`; None if there are none, or they belong to another URDF."""
+    """The stored shapes of the URDF at `path`; None if there are none, or they belong to another URDF."""
     file = path.with_name(PREPARED)
     if not file.is_file():
         return None

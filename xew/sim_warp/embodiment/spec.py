@@ -1,4 +1,4 @@
-"""`RobotSpec`: what the simulator knows of a robot beside its URDF."""
+"""`RobotSpec`: base poses, home, tool frame and limits of a robot, in addition to its URDF."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -6,15 +6,15 @@ from pathlib import Path
 from xew.sim_warp.geometry.poses import Pose
 
 USUAL_ACCELERATION = 15.0
-"""Acceleration limit of joints of which none is known [rad/s²]: that of RoboTwin's planner for four of its five robots."""
+"""Acceleration limit of joints without a known limit [rad/s²]; RoboTwin's planner uses it for four of its five robots."""
 
 
 @dataclass(frozen=True)
 class Arm:
-    """One arm of a bimanual robot: which joints of the URDF it is and how its tool sits."""
+    """One arm of a bimanual robot: its base, joints, tool frame and fingers."""
 
     root_pose: Pose
-    """Pose of the URDF's root link in the world. A robot of one URDF with both arms has the same in both."""
+    """Pose of the URDF's root link in the world; equal for both arms if one URDF holds both."""
     joints: tuple[str, ...]
     """Six or seven revolute joints of the URDF, from the base outward."""
     home: tuple[float, ...]
@@ -22,8 +22,8 @@ class Arm:
     tool_link: str
     """Name of the link that carries the tool frame."""
     tool_pose: Pose
-    """Tool frame in `tool_link`: x approach (out of the hand), y along which the fingers open, origin between
-    the finger pads where an object is held (the tool center point, TCP)."""
+    """Tool frame in `tool_link`: x approach (out of the hand), y opening direction of the fingers, origin between the finger
+    pads (the tool center point, TCP)."""
     fingers: tuple[str, str]
     """Names of the two prismatic joints of the gripper."""
     finger_closed: tuple[float, float]
@@ -31,7 +31,7 @@ class Arm:
     finger_open: tuple[float, float]
     """Finger joint positions at gripper 1 [m]."""
     rest: tuple[float, ...] = ()
-    """Joint positions at which motion of its own begins [rad]; `home` where left out."""
+    """Joint positions at which own motion begins [rad]; default: `home`."""
 
 
 @dataclass(frozen=True)
@@ -44,16 +44,16 @@ class RobotSpec:
     """Name in headings of tables and pages."""
     urdf: Path
     arms: tuple[Arm, Arm]
-    """Left arm (at -x) and right arm (at +x); the robot stands at -y and looks to +y."""
+    """Left arm (at -x) and right arm (at +x); the robot stands at -y and faces +y."""
     joint_lower: tuple[float, ...]
     """Lower position limits of an arm that experts keep [rad]: the real robot's, inside the URDF's."""
     joint_upper: tuple[float, ...]
     joint_velocity: tuple[float, ...]
     """Speed limits that experts keep [rad/s]."""
     joint_acceleration: tuple[float, ...] = ()
-    """Acceleration limits that motion of its own keeps [rad/s²]; `USUAL_ACCELERATION` where left out."""
+    """Acceleration limits of own motion [rad/s²]; default: `USUAL_ACCELERATION`."""
     label: str = ""
-    """Short name in columns and legends; the title where it is left out."""
+    """Short name in columns and legends; default: the title."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "label", self.label or self.title)
@@ -62,7 +62,7 @@ class RobotSpec:
 
     @property
     def one_urdf_holds_both_arms(self) -> bool:
-        """True for one URDF with two arms, False for a URDF of one arm that is put up twice."""
+        """True for one URDF with two arms, False for two copies of a URDF with one arm."""
         return self.arms[0].joints != self.arms[1].joints
 
     @property

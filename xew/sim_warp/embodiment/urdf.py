@@ -1,7 +1,6 @@
 """Reading URDFs: `load_urdf(path)` gives links, joints, colored meshes and convex collision shapes.
 
-yourdfpy parses the XML, trimesh the mesh files; what comes out is a small tree of our own, so that the rest of the
-package knows neither. Units are meters, kilograms and radians; every shape is in the frame of its link.
+yourdfpy parses the XML, trimesh the mesh files. Units are meters, kilograms and radians; shapes are in the frame of their link.
 """
 
 import math
@@ -26,15 +25,15 @@ from xew.sim_warp.geometry.meshes import Color, Mesh, from_trimesh, merge
 Entry = TypeVar("Entry", bound=Any)
 Result = TypeVar("Result")
 DEFAULT_COLOR: Color = (190, 190, 190)
-"""Color of a visual that names no material."""
+"""Color of a visual without a material."""
 HULL_POINTS = 64
-"""Largest number of corners of a collision hull; of finer ones those are kept that lie farthest out in as many directions."""
+"""Largest number of corners of a collision hull; finer hulls keep the outermost corner in each of as many directions."""
 LARGEST_LINK = 10.0
-"""Largest extent of a link [m]; beyond it its mesh must be in millimeters."""
+"""Largest extent of a link [m]; larger meshes are probably in millimeters."""
 
 
 class UrdfError(ConfigError):
-    """A URDF, or a mesh that it names, cannot be used; the message says what to do."""
+    """A URDF or one of its meshes cannot be used; the message says what to do."""
 
 
 @dataclass(frozen=True)
@@ -51,10 +50,10 @@ class Inertial:
 
 @dataclass(frozen=True)
 class Collision:
-    """A convex shape that a link collides with."""
+    """A convex collision shape of a link."""
 
     name: str
-    """Name in the URDF; "pad" is the gripping face of a finger. Empty where the URDF names none."""
+    """Name in the URDF, "pad" for the gripping face of a finger; empty if it has none."""
     points: np.ndarray
     """[k 3] float32, corners of its convex hull in the link frame, m."""
 
@@ -63,7 +62,7 @@ class Collision:
 class Link:
     name: str
     visual: Mesh | None
-    """Mesh of all visuals of the link; None where it has none."""
+    """Merged mesh of the link's visuals; None if it has none."""
     collisions: tuple[Collision, ...]
     inertial: Inertial | None
 
@@ -87,7 +86,7 @@ class Joint:
     effort: float
     """Effort limit [N m or N], inf where there is none."""
     mimic: tuple[str, float, float] | None = None
-    """Joint whose position decides this one's, with factor and offset; None where it moves by itself."""
+    """Joint that this one mimics, with factor and offset; None if it moves independently."""
 
 
 @dataclass(frozen=True)
@@ -100,15 +99,15 @@ class Urdf:
     links: dict[str, Link]
     joints: dict[str, Joint]
     meshes: dict[str, Path]
-    """File of each mesh by the name that the URDF gives it."""
+    """File of each mesh by its name in the URDF."""
     files: tuple[Path, ...]
     """Files that were read: the URDF, meshes, their materials and textures."""
     notes: tuple[str, ...] = ()
-    """Sentences on what was taken in another way than the file says it."""
+    """Sentences on deviations from the file's content."""
 
     @cached_property
     def joint_names(self) -> tuple[str, ...]:
-        """The joints that move, in file order: what a `joint_pos [n j]` lists. Mimic tags are not followed."""
+        """The moving joints in file order, the columns of `joint_pos [n j]`. Mimic tags are not followed."""
         return tuple(name for name, joint in self.joints.items() if joint.kind != "fixed")
 
     @cached_property
@@ -142,10 +141,10 @@ def load_urdf(path: Path | str) -> Urdf:
     """Read a URDF with its meshes; a file that has not changed is read once.
 
     Args:
-        path: the file. Mesh names may be relative to it, absolute or `package://`, which is looked for in the folders above.
+        path: the file. Mesh names may be relative to it, absolute or `package://`, which is searched in the folders above.
 
     Raises:
-        UrdfError: the file or a mesh is missing or cannot be understood, or it is not one tree; says which and what to do.
+        UrdfError: the file or a mesh is missing or invalid, or the links do not form one tree.
     """
     path = Path(path).resolve()
     if not path.is_file():
@@ -156,10 +155,10 @@ def load_urdf(path: Path | str) -> Urdf:
 @lru_cache(maxsize=256)
 def _load(path: Path, modified: int) -> Urdf:
     try:
-        ElementTree.parse(path)  # yourdfpy reads on where a file ends too early
+        ElementTree.parse(path)  # yourdfpy accepts truncated files
         robot = yourdfpy.URDF.load(str(path), build_scene_graph=False, load_meshes=False).robot
     except Exception as error:  # lxml and yourdfpy each have their own
-        raise UrdfError(f"{path} is not a URDF that can be read ({error}); mend its XML.") from error
+        raise UrdfError(f"{path} is not a URDF that can be read ({error}); fix its XML.") from error
     for kind, entries in (("link", robot.links), ("joint", robot.joints)):
         _check_names(path, kind, [entry.name for entry in entries])
     source = _Source(path, {material.name: material for material in robot.materials}, {}, read_prepared(path))
@@ -174,7 +173,7 @@ def _load(path: Path, modified: int) -> Urdf:
     if not root:
         raise UrdfError(f"{path}: there is no link without a parent; links must form one tree.")
     if not any(link.collisions for link in links.values()):
-        source.notes.append("it has no collision shapes: the convex hulls of what is seen collide in their place")
+        source.notes.append("it has no collision shapes: the convex hulls of its visuals collide instead")
         links = {name: _with_hull(link) for name, link in links.items()}
     prepared = dict(source.prepared.meshes) if source.prepared else {}
     meshes = {name: file.files[0] for name, file in source.meshes.items()} | prepared | source.textures
@@ -185,7 +184,7 @@ def _load(path: Path, modified: int) -> Urdf:
 
 
 def _read_all(entries: Iterable[Entry], read: Callable[[Entry], Result], problems: list[str]) -> dict[str, Result]:
-    """What `read` makes of each entry, by its name; what is wrong with them is added to `problems`, so all are reported."""
+    """Result of `read` for each entry, by its name; all errors are collected in `problems`."""
     results: dict[str, Result] = {}
     for entry in entries:
         try:
@@ -196,7 +195,7 @@ def _read_all(entries: Iterable[Entry], read: Callable[[Entry], Result], problem
 
 
 def _with_hull(link: Link) -> Link:
-    """The link with the convex hull of its visual as its collision shape, where that has a volume."""
+    """The link with the convex hull of its visual as collision shape, if the hull has a volume."""
     if link.visual is None:
         return link
     try:
@@ -208,24 +207,23 @@ def _with_hull(link: Link) -> Link:
 
 @dataclass(frozen=True)
 class _Source:
-    """A URDF while it is read."""
+    """State of reading a URDF."""
 
     path: Path
     materials: dict[str, yourdfpy.Material]
     meshes: dict[str, MeshFile]
-    """Mesh files read so far, by the name that the URDF gives them."""
+    """Mesh files read so far, by their name in the URDF."""
     prepared: Prepared | None
-    """Shapes that lie ready beside the URDF, None where there are none."""
+    """Stored shapes of the URDF, if any."""
     textures: dict[str, Path] = field(default_factory=dict)
-    """Pictures of materials, by the name that the URDF gives them."""
+    """Texture images, by their name in the URDF."""
     notes: list[str] = field(default_factory=list)
-    """Sentences on what was taken in another way than the file says it."""
 
 
 def prepare(path: Path) -> None:
-    """Put the shapes of a URDF beside it as arrays, from which `load_urdf` reads it five times as fast.
+    """Store the shapes of a URDF next to it as arrays, from which `load_urdf` reads it five times as fast.
 
-    For folders that nobody changes: the arrays count as long as the URDF has the same bytes, whatever becomes of its meshes.
+    For folders that never change: the arrays are valid as long as the URDF has the same bytes, even if its meshes change.
     """
     urdf = _load.__wrapped__(path, 0)
     shapes = {name: (link.visual, tuple((c.name, c.points) for c in link.collisions)) for name, link in urdf.links.items()}
@@ -241,12 +239,12 @@ def _finite_array(values: object, path: Path, what: str) -> np.ndarray:
     """The values as float64. Raises UrdfError if one is not a finite number."""
     array = np.asarray(values, float)
     if not np.isfinite(array).all():
-        raise UrdfError(f"{path}: {what} has a number that is not finite; mend it.")
+        raise UrdfError(f"{path}: {what} has a number that is not finite; expected finite numbers.")
     return array
 
 
 def _check_tree(urdf: Urdf) -> None:
-    """All links hang together from one root, each by one joint."""
+    """Raise UrdfError unless all links form one tree."""
     path, links, joints = urdf.path, set(urdf.links), urdf.joints.values()
     if unknown := sorted({name for joint in joints for name in (joint.parent, joint.child)} - links):
         raise UrdfError(f"{path}: joints name links that do not exist: {', '.join(unknown)}; add or rename them.")
@@ -263,7 +261,7 @@ def _joint(joint: yourdfpy.Joint, path: Path) -> Joint:
     axis = (
         np.array([1.0, 0.0, 0.0]) if joint.axis is None else _finite_array(joint.axis, path, f"the axis of joint {joint.name}")
     )
-    if not np.any(axis) and joint.type == "fixed":  # URDF ignores the axis of a fixed joint, and many files say 0 0 0
+    if not np.any(axis) and joint.type == "fixed":  # URDF ignores it, and many files have 0 0 0
         axis = np.array([1.0, 0.0, 0.0])
     if not np.any(axis):
         raise UrdfError(f"{path}: joint {joint.name} has the axis 0 0 0; give it a direction.")
@@ -331,7 +329,7 @@ def _inertial(link: yourdfpy.Link, path: Path) -> Inertial | None:
 
 
 def _visual(visual: yourdfpy.Visual, link: str, source: _Source) -> Iterable[Mesh]:
-    """A mesh a part, colored by the visual's material or else by the mesh file."""
+    """One mesh per part, colored by the visual's material or else by the mesh file."""
     origin = _origin(visual.origin, source.path, f"a visual of link {link}")
     color, picture = _material_color(visual, source), _material_texture(visual, link, source)
     for part in _shape(visual.geometry, link, source):
@@ -344,7 +342,7 @@ def _visual(visual: yourdfpy.Visual, link: str, source: _Source) -> Iterable[Mes
 
 
 def _material_entry(visual: yourdfpy.Visual, source: _Source, name: str) -> Any | None:
-    """The color or texture of a visual's material, or of the one that it names; None where neither has it."""
+    """The color or texture of a visual's material or of the global material of its name; None if neither has it."""
     if visual.material is None:
         return None
     known = source.materials.get(visual.material.name)
@@ -352,7 +350,7 @@ def _material_entry(visual: yourdfpy.Visual, source: _Source, name: str) -> Any 
 
 
 def _material_color(visual: yourdfpy.Visual, source: _Source) -> Color | None:
-    """The visual's own color, or that of the material it names; None where the mesh file decides."""
+    """The color of a visual's material; None if the mesh file has the colors."""
     color = _material_entry(visual, source, "color")
     if color is None:
         return None
@@ -361,7 +359,7 @@ def _material_color(visual: yourdfpy.Visual, source: _Source) -> Color | None:
 
 
 def _material_texture(visual: yourdfpy.Visual, link: str, source: _Source) -> Any | None:
-    """The picture of the visual's material, or of the one it names; None where there is none."""
+    """The texture image of a visual's material; None if there is none."""
     texture = _material_entry(visual, source, "texture")
     if texture is None or not texture.filename:
         return None
@@ -386,7 +384,7 @@ def _collision(collision: yourdfpy.Collision, link: str, source: _Source) -> Col
 
 
 def outermost_points(points: np.ndarray, most: int) -> np.ndarray:
-    """Of points [k 3] those that lie farthest out in `most` evenly spread directions; all if there are no more."""
+    """The points among [k 3] that are outermost in `most` evenly spread directions; all if k <= most."""
     if len(points) <= most:
         return points
     step = np.arange(most) + 0.5
@@ -423,9 +421,9 @@ def _mesh_parts(mesh: yourdfpy.Mesh, link: str, source: _Source) -> list[Part]:
 
 
 def _find_file(name: str, who: str, source: _Source) -> Path:
-    """A file by the name that the URDF gives it: relative to the URDF, absolute, `file://` or `package://`.
+    """A file by its name in the URDF: relative to the URDF, absolute, `file://` or `package://`.
 
-    An absolute name of another machine is looked for by its end beside the URDF and in the two folders above. `who` begins the
+    An absolute name of another machine is searched by its end in the URDF's folder and the two folders above. `who` begins the
     error's sentence.
     """
     folder = source.path.parent
@@ -437,11 +435,11 @@ def _find_file(name: str, who: str, source: _Source) -> Path:
     if not package and (name.startswith("file://") or Path(name).is_absolute()):
         for near, skipped in product((folder, *folder.parents[:2]), range(len(parts))):
             if (other := near.joinpath(*parts[skipped:])).is_file():
-                source.notes.append(f"{name} is not on this machine: {other} is taken for it")
+                source.notes.append(f"{name} is not on this machine: {other} is used instead")
                 return other
     advice = (
         f"name the package's folder: python -m xew.sim_warp.robots.adopt {source.path} --package {package[1]}=DIR"
         if package
-        else "put it there or mend the name"
+        else "put it there or correct the name"
     )
     raise UrdfError(f"{source.path}: {who} {name}, which does not exist; {advice}.")

@@ -1,6 +1,6 @@
-"""Shapes and places: triangle meshes, poses with their transforms, and the pinhole camera.
+"""Geometry: triangle meshes, poses with their transforms, and the pinhole camera.
 
-Arrays in meters and radians in, arrays out; nothing here knows robots, tasks or a device.
+Functions of arrays in meters and radians, independent of robots, tasks and devices.
 """
 
 __all__ = ["camera", "meshes", "poses", "surface_points"]

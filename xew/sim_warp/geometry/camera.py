@@ -1,7 +1,4 @@
-"""Cameras as objects: where they stand and what they show, by the convention of `xew.episode.project`. NumPy only.
-
-All episodes are seen by HEAD_CAMERA; to see them from elsewhere, change it.
-"""
+"""Pinhole cameras by the convention of `xew.episode.project`. All episodes are rendered by HEAD_CAMERA."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -37,13 +34,13 @@ def look_at(
     width: int = WIDTH,
     height: int = HEIGHT,
 ) -> Camera:
-    """A centered camera at `position` [m] that looks at `target` [m], `up` upward in the image.
+    """A centered camera at `position` [m] facing `target` [m], with `up` upward in the image.
 
     Args:
         vertical_fov: full vertical angle of view [deg].
 
     Raises:
-        ValueError: `up` lies along the line of sight, or position and target coincide.
+        ValueError: `up` is parallel to the line of sight, or position and target coincide.
     """
     forward = np.subtract(target, position).astype(float)
     right = np.cross(forward, up)
@@ -61,12 +58,9 @@ def look_at(
 
 
 def project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels [... 2] and depths along the optical axis [...] m of world points [... 3] m: `projection.project` by a camera.
-
-    Points at or behind the camera (depth <= 0) have no image; their pixels are NaN.
-    """
+    """Pixels [... 2] and depths along the optical axis [...] m of world points [... 3] m, see `xew.episode.project`."""
     return episode.project(points, camera.intrinsics, camera.extrinsics)
 
 
 HEAD_CAMERA = look_at(position=(-0.032, -0.45, 1.35), target=(-0.032, 0.15, 0.55))
-"""RoboTwin's head camera: fixed over the table, 53 degrees down, 37 degrees high; the same for all robots."""
+"""RoboTwin's head camera: fixed above the table, 53 degrees down, vertical field of view 37 degrees."""

@@ -1,7 +1,6 @@
-"""Triangle meshes: what robots and objects look like and, as hulls, what they collide with.
+"""Triangle meshes of robots and objects.
 
-Units are meters, frames are those of the body that carries the mesh, triangles run counter-clockwise seen from
-outside. Shapes come from trimesh; a `Mesh` adds a color per triangle and a normal per corner.
+Units are meters, in the frame of the body. Triangles are counter-clockwise seen from outside. Shapes come from trimesh.
 """
 
 import functools
@@ -49,7 +48,7 @@ def from_trimesh(shape: trimesh.Trimesh, color: Color, crease_angle: float = np.
 
 
 def _corner_normals(shape: trimesh.Trimesh, face_normals: np.ndarray, crease_angle: float) -> np.ndarray:
-    """Corner normal = area-weighted mean over the faces round the vertex that bend less than the crease angle."""
+    """[f 3 3] area-weighted mean normals over the faces round each vertex that bend less than the crease angle."""
     weighted = face_normals * shape.area_faces[:, None]
     around = shape.vertex_faces[shape.faces]  # [f 3 k], -1 where there is no further face
     aligned = np.einsum("fi,fcki->fck", face_normals, face_normals[around]) > np.cos(crease_angle)
@@ -60,7 +59,7 @@ def _corner_normals(shape: trimesh.Trimesh, face_normals: np.ndarray, crease_ang
 
 def box(size: Sequence[float], color: Color) -> Mesh:
     """A box of full edge lengths `size` [m], centered."""
-    corners, triangles, normals = _unit_box()  # a scene can have hundreds, whose normals are all the same
+    corners, triangles, normals = _unit_box()  # cached: a scene can have hundreds
     colors = np.tile(np.asarray(color, np.uint8), (len(triangles), 1))
     return Mesh((corners * np.asarray(size, float)).astype(np.float32), triangles.copy(), colors, normals.copy())
 
@@ -79,7 +78,7 @@ def cylinder(radius: float, length: float, color: Color, sections: int = 24) -> 
 
 
 def capsule(radius: float, length: float, color: Color, sections: int = 16) -> Mesh:
-    """A capsule along z, centered; `length` [m] is that of its cylinder."""
+    """A capsule along z, centered; `length` [m] is the length of its cylinder."""
     shape = trimesh.creation.capsule(length, radius, count=(sections // 2, sections))
     shape.apply_translation(-shape.bounds.mean(0))
     return from_trimesh(shape, color)
@@ -91,8 +90,8 @@ def sphere(radius: float, color: Color, subdivisions: int = 2) -> Mesh:
 
 
 def revolve(profile: Sequence[Sequence[float]], color: Color, sections: int = 32) -> Mesh:
-    """A body of revolution about z from a profile of (radius, height) pairs [m], listed from the axis upward
-    along the outside and back along the inside, so that the surface faces outward."""
+    """A body of revolution about z from a profile of (radius, height) pairs [m], upward along the outside and back along the
+    inside."""
     return from_trimesh(trimesh.creation.revolve(np.asarray(profile, float), sections=sections), color)
 
 

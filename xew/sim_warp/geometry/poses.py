@@ -8,7 +8,7 @@ Pose = tuple[float, float, float, float, float, float, float]
 
 
 def pose_from_matrix(matrix: np.ndarray) -> np.ndarray:
-    """[... 4 4] to [... 7]; of the two quaternions of a rotation the one with w >= 0."""
+    """[... 4 4] to [... 7], with quaternions of w >= 0."""
     quaternion = Rotation.from_matrix(matrix[..., :3, :3]).as_quat(canonical=True)
     return np.concatenate([matrix[..., :3, 3], quaternion], -1)
 

@@ -1,7 +1,7 @@
-"""Points on the surfaces of meshes: where they are and which way they face, the same for a mesh every time.
+"""Points and normals on the surfaces of meshes, deterministic for each mesh.
 
-They are drawn with a density proportional to area and thinned so that the nearest two are as far apart as a greedy choice
-makes them (farthest-point sampling, Y. Eldar et al., "The farthest point strategy for progressive image sampling", 1997).
+Points are drawn with a density proportional to area and thinned by farthest-point sampling (Y. Eldar et al., "The farthest
+point strategy for progressive image sampling", 1997).
 """
 
 import numpy as np
@@ -9,7 +9,7 @@ import numpy as np
 from xew.sim_warp.geometry.meshes import Mesh
 
 CANDIDATES_PER_POINT = 8
-"""Number of points that are drawn for each one that stays."""
+"""Number of drawn candidates per selected point."""
 SEED = 20_14
 """Key of the counter-based generator that draws the candidates."""
 
@@ -22,8 +22,8 @@ def sample_surface(mesh: Mesh, count: int) -> tuple[np.ndarray, np.ndarray]:
         count: number of points.
 
     Returns:
-        Points [count 3] float64 m and outward unit normals of their triangles [count 3] float64, frame of the body; none
-        where the mesh has no area.
+        Points [count 3] float64 m and outward unit normals of their triangles [count 3] float64, frame of the body; empty
+        arrays if the mesh has no area.
 
     Raises:
         ValueError: the count is negative.
@@ -41,17 +41,17 @@ def sample_surface(mesh: Mesh, count: int) -> tuple[np.ndarray, np.ndarray]:
     root, other = np.sqrt(rng.random(len(triangle)))[:, None], rng.random(len(triangle))[:, None]
     a, b, c = np.moveaxis(corners[triangle], 1, 0)
     points = (1 - root) * a + root * (1 - other) * b + root * other * c
-    kept = farthest_points(points, count)
-    return points[kept], (cross / np.where(area > 0, area, 1)[:, None])[triangle[kept]]
+    chosen = farthest_points(points, count)
+    return points[chosen], (cross / np.where(area > 0, area, 1)[:, None])[triangle[chosen]]
 
 
 def farthest_points(points: np.ndarray, count: int) -> np.ndarray:
-    """Indices [count] of points [n 3] that lie far apart: first the one farthest from the middle, then greedily."""
+    """Indices [count] of points [n 3] far apart: first the point farthest from the mean, then greedily."""
     nearest = np.full(len(points), np.inf)
-    kept: list[int] = []
+    chosen: list[int] = []
     following = int(np.argmax(np.linalg.norm(points - points.mean(axis=0), axis=-1)))
     for _ in range(min(count, len(points))):
-        kept.append(following)
+        chosen.append(following)
         nearest = np.minimum(nearest, np.linalg.norm(points - points[following], axis=-1))
         following = int(np.argmax(nearest))
-    return np.array(kept, int)
+    return np.array(chosen, int)

@@ -1,4 +1,4 @@
-"""Checks of a data set: hashes, plausible motion, and pictures rendered again; and the videos of episodes that have none."""
+"""Checks of a data set: hashes, plausible motion and re-rendering; and rendering of missing videos."""
 
 from functools import cache
 from pathlib import Path
@@ -14,21 +14,22 @@ from xew.sim_warp.production.warm_up import compile_kernels
 from xew.sim_warp.rendering.render import Renderer
 
 EPISODES_PER_WORKER = 32
-"""Number of episodes that are verified, or fewer rendered, in the time in which a process starts."""
+"""Number of episodes that justify one more process, by its start-up time."""
 
 
 def verify(folders: list[Path]) -> list[str]:
-    """Compare all files with their hashes, and motions with what is plausible; returns what is wrong with which episode."""
+    """Compare all files with their hashes and check motions for plausibility; returns the error messages."""
     with Workers(min(usable_cores(), len(folders) // EPISODES_PER_WORKER)) as workers:
-        found = workers.run(find_problem, folders) if len(folders) >= 2 * EPISODES_PER_WORKER else map(find_problem, folders)
-        bar = tqdm(found, desc="verifying", unit="episode", total=len(folders))
+        several = len(folders) >= 2 * EPISODES_PER_WORKER
+        results = workers.run(find_problem, folders) if several else map(find_problem, folders)
+        bar = tqdm(results, desc="verifying", unit="episode", total=len(folders))
         damaged = sorted(problem for problem in bar if problem)
     print(f"{len(folders) - len(damaged)} of {len(folders)} episodes agree with their hashes and are plausible")
     return damaged
 
 
 def find_problem(folder: Path) -> str:
-    """What is wrong with an episode; an empty text where nothing is."""
+    """The error message of an episode; empty if it is valid."""
     try:
         if not verify_episode(folder).source:
             demand_plausible(folder)
@@ -53,8 +54,8 @@ def render_videos(folders: list[Path]) -> None:
     with Workers(worker_count(devices), devices) as workers:
         if several:
             compile_kernels(workers, devices[0], 1, ("rendering",))
-        made = workers.run(_render_video, folders) if several else map(_render_video, folders)
-        for _ in tqdm(made, desc="rendering", unit="episode", total=len(folders)):
+        results = workers.run(_render_video, folders) if several else map(_render_video, folders)
+        for _ in tqdm(results, desc="rendering", unit="episode", total=len(folders)):
             pass
     print(f"videos of {len(folders)} episodes made from their states")
 

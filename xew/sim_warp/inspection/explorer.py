@@ -1,7 +1,7 @@
 """The explorer's page: chooses scenes, makes a film and a script of each, and writes the page that plays them.
 
 Writes <out>/index.html, and for every scene scenes/<number>_<task>_<seed>.js (overlays) and .mp4 (all robots' videos; one
-more for every model whose rollouts are shown). A page opens from a file; its scripts are read when their scene is chosen.
+more for every model with rollouts). The page works without a server; it loads a scene's script when the scene is selected.
 """
 
 import json
@@ -28,9 +28,9 @@ from xew.sim_warp.robots import ROBOTS, recorded_robot
 __all__ = ["Page", "Predictions", "Scene", "choose_scenes", "find_predictions", "write_page"]
 
 MOST_ROBOTS = 10
-"""Number of robots of a scene that are shown; more would make a film that browsers do not play."""
+"""Largest number of robots of a scene; browsers do not play larger films."""
 MARK = '<meta name="generator" content="xew explorer">'
-"""Line by which an explorer's page is known, so that no other page is replaced."""
+"""Line that identifies an explorer's page; no other page is replaced."""
 NO_FILE_NAME = re.compile(r"[^A-Za-z0-9_.-]")
 
 TEMPLATES = Environment(
@@ -52,50 +52,48 @@ class Scene:
     task: str
     seed: int
     cells: tuple[Episode, ...]
-    """Those that are shown, in the order of ROBOTS, others behind."""
+    """Shown episodes, in the order of ROBOTS, then others."""
     left_out: int
     """Number of robots that are not shown."""
 
 
 @dataclass(frozen=True)
 class Page:
-    """What a page shows."""
+    """Content of a page."""
 
     title: str
     scenes: Sequence[Scene]
     left_out: int
-    """Number of scenes of the data set that it does not show."""
+    """Number of scenes of the data set that are not shown."""
     predictions: Predictions
     flow: bool = True
-    """Is optical flow rendered from the commands?"""
-    given: bool = True
-    """Do rollouts hold the given frame 0? Else they begin with frame 1."""
+    """Whether optical flow is rendered from the commands."""
 
 
 def find_predictions(roots: Iterable[Path]) -> Predictions:
-    """Rollouts of all trees. Raises EpisodeError where two of one model are of one episode, RolloutError as `find_rollouts`."""
-    found: dict[str, dict[tuple[str, int, str], Rollout]] = {}
+    """Rollouts of all trees. Raises EpisodeError if a model has two of one episode, RolloutError as `find_rollouts`."""
+    predictions: dict[str, dict[tuple[str, int, str], Rollout]] = {}
     for rollout in (rollout for root in roots for rollout in find_rollouts(root)):
-        of_model = found.setdefault(" · ".join(filter(None, (rollout.model, rollout.condition))), {})
+        of_model = predictions.setdefault(" · ".join(filter(None, (rollout.model, rollout.condition))), {})
         other = of_model.setdefault((rollout.task, rollout.seed, rollout.robot), rollout)
         if other is not rollout:
             raise EpisodeError(
-                f"{other.folder} and {rollout.folder} are both of the model {rollout.model!r}, expected one rollout of an "
-                "episode; leave one of the trees out of --rollouts."
+                f"{other.folder} and {rollout.folder} are both of the model {rollout.model!r}, expected one rollout per "
+                "episode; remove one of the trees from --rollouts."
             )
-    return found
+    return predictions
 
 
 def choose_scenes(
     cells: Iterable[Episode], wanted: Sequence[str], most: int, predictions: Predictions
 ) -> tuple[list[Scene], int]:
-    """Scenes to show, and the number of those that are left out.
+    """Scenes to show, and the number of other scenes.
 
     Args:
         cells: episodes with videos.
-        wanted: TASK or TASK/SEED; all scenes where there is none.
-        most: number of scenes at most, the first seed of every task before the second.
-        predictions: where there are some, only scenes that one of them is of are shown.
+        wanted: TASK or TASK/SEED; empty for all scenes.
+        most: largest number of scenes, the first seed of every task before the second.
+        predictions: if not empty, only scenes with a prediction are shown.
 
     Raises:
         EpisodeError: a name in `wanted` is in no episode, or there is no scene to show.
@@ -104,7 +102,6 @@ def choose_scenes(
     for folder, record in cells:
         scenes.setdefault((record.task, record.seed), []).append((folder, record))
     known = {name for task, seed in scenes for name in (task, f"{task}/{seed}")}
-    # A seed is also found as its folder is called, 0800000.
     names = [_plain_seed(name) for name in wanted]
     if missing := [name for name in names if name not in known]:
         raise EpisodeError(
@@ -118,7 +115,7 @@ def choose_scenes(
         if (not names or task in names or f"{task}/{seed}" in names) and (not predictions or (task, seed) in predicted)
     ]
     if not fit:
-        raise EpisodeError("none of the scenes with videos has a rollout; name the data set that --rollouts are of.")
+        raise EpisodeError("none of the scenes with videos has a rollout; pass the data set of --rollouts.")
     seeds: dict[str, list[int]] = {}
     for task, seed in sorted(fit):
         seeds.setdefault(task, []).append(seed)
@@ -128,6 +125,7 @@ def choose_scenes(
 
 
 def _plain_seed(name: str) -> str:
+    """TASK/SEED with the seed as a plain number: folders are named 0800000."""
     task, slash, seed = name.rpartition("/")
     return f"{task}/{int(seed)}" if slash and seed.isdecimal() else name
 
@@ -139,15 +137,15 @@ def _scene(task: str, seed: int, cells: Sequence[Episode]) -> Scene:
 
 
 def write_page(page: Page, out: Path) -> None:
-    """Write a page and what it plays into a folder, index.html last.
+    """Write a page and its films into a folder, index.html last.
 
     Raises:
-        EpisodeError: another page is there, or the folder cannot be written.
+        EpisodeError: the folder has another page or cannot be written.
     """
     index = out / "index.html"
     try:
         if index.exists() and MARK not in read_text(index):
-            raise EpisodeError(f"{index} is not a page of the explorer and is kept; choose another folder with --page.")
+            raise EpisodeError(f"{index} is not a page of the explorer; choose another folder with --page.")
         with hold_lock(out):
             bar = tqdm(page.scenes, desc="filming", unit="scene", disable=None)
             entries = [_write_scene(number, scene, page, out) for number, scene in enumerate(bar)]
@@ -200,11 +198,11 @@ def _write_scene(number: int, scene: Scene, page: Page, out: Path) -> dict[str, 
 
 
 def _write_films(stem: str, scene: Scene, page: Page, rows: dict[str, Row], out: Path) -> list[dict[str, Any]]:
-    """Write a film of a scene for every model that predicts some of it, or one without; returns what the page needs of them."""
+    """Write a film of a scene for every model with predictions, or one without; returns their entries for the page."""
     truths = [truth for truth in rows["video"] if truth is not None]
     films = []
     for place, (label, rollouts) in enumerate(_models(scene, page.predictions)):
-        predicted = [_read_prediction(rollout, truth, page.given) for rollout, truth in zip(rollouts, truths, strict=True)]
+        predicted = [_read_prediction(rollout, truth) for rollout, truth in zip(rollouts, truths, strict=True)]
         pairs = list(zip(predicted, truths, strict=True))
         shown = dict(rows)
         if label:
@@ -221,25 +219,24 @@ def _write_films(stem: str, scene: Scene, page: Page, rows: dict[str, Row], out:
 
 def _flow(cell: Episode, states: States) -> np.ndarray:
     """The commanded robot's optical flow as a color wheel on white: [t h w 3] uint8."""
-    from xew.sim_warp.rendering.streams import command_streams, flow_to_rgb  # here, so that a page without it needs no Warp
+    from xew.sim_warp.rendering.streams import command_streams, flow_to_rgb  # here: a page without flow needs no Warp
 
     folder, record = cell
     return flow_to_rgb(command_streams(recorded_robot(record.robot, data_folder(folder)), states.action).optical_flow)
 
 
 def _models(scene: Scene, predictions: Predictions) -> list[tuple[str, list[Rollout | None]]]:
-    """Models that predict robots of a scene, with a rollout of each robot or None; without any an empty label."""
-    found = []
+    """Models with predictions of a scene, each with a rollout or None per robot; one empty label if there are none."""
+    models = []
     for label, rollouts in predictions.items():
         of_scene = [rollouts.get((scene.task, scene.seed, record.robot)) for _, record in scene.cells]
         if any(of_scene):
-            found.append((label, of_scene))
-    return found or [("", [None] * len(scene.cells))]
+            models.append((label, of_scene))
+    return models or [("", [None] * len(scene.cells))]
 
 
-def _read_prediction(rollout: Rollout | None, truth: np.ndarray, given: bool) -> np.ndarray | None:
-    """The video of a rollout at its episode's size, from frame 0 on and at most as long: [t h w 3] uint8."""
+def _read_prediction(rollout: Rollout | None, truth: np.ndarray) -> np.ndarray | None:
+    """The video of a rollout at its episode's size, at most as long as the episode: [t h w 3] uint8."""
     if rollout is None:
         return None
-    video = resize_video(read_rollout_video(rollout), truth.shape[1:3])
-    return (video if given else np.concatenate([truth[:1], video]))[: len(truth)]
+    return resize_video(read_rollout_video(rollout), truth.shape[1:3])[: len(truth)]

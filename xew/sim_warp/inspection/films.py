@@ -1,7 +1,4 @@
-"""One H.264 file for all videos of a scene, laid out as rows and columns of tiles.
-
-Videos of one file have one clock and one decoder, so that they cannot come apart and a step is one seek.
-"""
+"""One H.264 file for all videos of a scene, as rows and columns of tiles: they stay synchronized, and a step is one seek."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from fractions import Fraction
@@ -16,23 +13,23 @@ from xew.files import replacing
 __all__ = ["Row", "difference_video", "tile_frames", "tile_size", "write_film"]
 
 ENCODER = {"crf": "18", "g": "12", "bf": "0", "preset": "veryfast"}
-"""Settings of libx264. A key frame comes every 12 frames, so that a browser reaches any frame quickly."""
+"""Settings of libx264, with a key frame every 12 frames for fast seeking."""
 DIFFERENCE_FULL = 96
-"""Difference, in levels of 255, from which on the difference is drawn black, as in reports."""
+"""Least difference that is drawn black, in levels of 255, as in reports."""
 
 Row = Sequence[np.ndarray | None]
-"""Videos [t h w 3] uint8 by column; None where there is none."""
+"""Videos [t h w 3] uint8 by column, or None."""
 
 
 def tile_size(rows: Sequence[Row]) -> tuple[int, int]:
-    """Height and width of a tile: those of the largest video, made even as the codec needs them [pixels]."""
+    """Height and width of the largest video, rounded up to even numbers for the codec [pixels]."""
     sizes = np.array([video.shape[1:3] for row in rows for video in row if video is not None])
     height, width = sizes.max(0)
     return int(height + height % 2), int(width + width % 2)
 
 
 def tile_frames(rows: Sequence[Row], count: int) -> Iterator[np.ndarray]:
-    """Frames [H W 3] uint8 of a film; each video lies at the upper left of its tile and stays at its last frame.
+    """Frames [H W 3] uint8 of a film; each video is at the upper left of its tile and stops at its last frame.
 
     Args:
         rows: videos [t h w 3] uint8, as many columns in every row.
@@ -51,7 +48,7 @@ def tile_frames(rows: Sequence[Row], count: int) -> Iterator[np.ndarray]:
 
 
 def difference_video(prediction: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """Largest channel difference of two videos [t h w 3] uint8 as a gray video [t h w 3] uint8, as long as the shorter.
+    """Largest channel difference of two videos [t h w 3] uint8 as a gray video [t h w 3] uint8, as long as the shorter one.
 
     White is no difference, black is DIFFERENCE_FULL or more.
     """
@@ -62,10 +59,10 @@ def difference_video(prediction: np.ndarray, truth: np.ndarray) -> np.ndarray:
 
 
 def write_film(path: Path, frames: Iterable[np.ndarray], frame_rate: float) -> None:
-    """Write frames [h w 3] uint8 RGB of even height and width as H.264 that browsers play, in MP4; frame k begins at k / rate.
+    """Write frames [h w 3] uint8 RGB of even height and width as H.264 for browsers, in MP4; frame k begins at k / rate.
 
     Raises:
-        OSError: it cannot be written there, or the disk is full.
+        OSError: the file cannot be written, or the disk is full.
     """
     rate = Fraction(frame_rate).limit_denominator(1000)
     with replacing(path) as temporary:

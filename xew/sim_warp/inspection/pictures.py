@@ -16,14 +16,14 @@ from xew.sim_warp.robots import ROBOTS
 
 STRIP_FRAMES = 8
 SHEET_TIMES = (0.0, 0.5, 1.0)
-"""Instants that a contact sheet shows, as shares of the episode."""
+"""Instants of a contact sheet, as shares of the episode."""
 BLANK = np.full((HEIGHT // 2, WIDTH // 2, 3), 255, np.uint8)
 GAP = 4
 """Width of the white between pictures [pixels]."""
 AT_WORK = 0.6
-"""Share of an episode after which the hands are at work."""
+"""Share of an episode at which the hands are usually at work."""
 LABEL_WIDTH, LABEL_HEIGHT, TEXT_SCALE = 96, 24, 0.42
-"""Size of the names in a grid or sheet [pixels], and the scale of their letters."""
+"""Size of the labels in a grid or sheet [pixels], and the scale of their letters."""
 
 
 def draw_pictures(cells: list[tuple[Path, Record]], out: Path, seeds: int) -> None:
@@ -53,7 +53,7 @@ def _make_folder(folder: Path, option: str) -> None:
 
 
 def draw_grid(cells: list[tuple[Path, Record]], path: Path) -> None:
-    """Write `grid` of the first seed of each task as a PNG; 25 tasks and five robots take 1.1 MB."""
+    """Write `grid` of the first seed of each task as a PNG."""
     _make_folder(path.parent, "--grid")
     picture = grid([of_task[min(of_task)] for of_task in seeds_by_task(cells).values()])
     try:
@@ -65,10 +65,10 @@ def draw_grid(cells: list[tuple[Path, Record]], path: Path) -> None:
 
 
 def grid(seeds: list[list[tuple[Path, Record]]]) -> np.ndarray:
-    """One seed of every task, a column each under its name, and a robot a row, at half size: [h w 3] uint8.
+    """One seed per task as columns, robots as rows, at half size: [h w 3] uint8.
 
-    In a column all robots are shown at the same instant, see `busy_instants`. Columns stand in bands of equal length, one
-    under the other, about as many as make the picture as wide as high.
+    A column shows all robots at the same instant, see `busy_instants`. Columns are arranged in bands of equal length for an
+    about square picture.
     """
     present = {record.robot for cells in seeds for _, record in cells}
     robots = [robot for robot in ROBOTS if robot in present] + sorted(present - set(ROBOTS))
@@ -85,7 +85,7 @@ def grid(seeds: list[list[tuple[Path, Record]]]) -> np.ndarray:
 
 
 def _column(cells: list[tuple[Path, Record]], robots: list[str]) -> np.ndarray:
-    """A task's name over one picture a robot: [h w 3] uint8."""
+    """A task's name over one picture per robot: [h w 3] uint8."""
     folders = {record.robot: folder for folder, record in cells}
     instants = dict(zip(folders, busy_instants([read_states(folder).contact for folder in folders.values()]), strict=True))
     images = [
@@ -96,9 +96,9 @@ def _column(cells: list[tuple[Path, Record]], robots: list[str]) -> np.ndarray:
 
 
 def busy_instants(contacts: list[np.ndarray]) -> list[int]:
-    """For every robot the frame nearest to 60 % of the episodes at which all of them touch something, or that at 60 %.
+    """For every robot, the frame nearest to 60 % of the episode at which all robots touch something, or the frame at 60 %.
 
-    It is one frame for all, but for episodes of different lengths, as imported ones are: those share no clock.
+    It is the same frame for all robots if their episodes have the same length; otherwise each robot has its own.
 
     Args:
         contacts: [t 2 o] bool of every robot, whether its left, right fingers touch each object.
@@ -111,7 +111,7 @@ def busy_instants(contacts: list[np.ndarray]) -> list[int]:
 
 
 def _label(text: str, width: int, height: int = LABEL_HEIGHT) -> np.ndarray:
-    """Text on white [h w 3] uint8, smaller where it would not fit."""
+    """Text on white [h w 3] uint8, shrunk to fit."""
     image = np.full((height, width, 3), 255, np.uint8)
     (wide, high), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 1.0, 1)
     scale = min(TEXT_SCALE, (width - 8) / max(1, wide))
@@ -124,7 +124,7 @@ def _halve(image: np.ndarray) -> np.ndarray:
 
 
 def contact_sheet(cells: list[tuple[Path, Record]]) -> np.ndarray:
-    """A seed's robots one under the other by name, each at its start, middle and end, under the instruction: [h w 3] uint8."""
+    """The instruction over one row per robot: its start, middle and end: [h w 3] uint8."""
     rows = []
     for folder, _ in cells:
         video = read_video(folder / "rgb.mkv")
@@ -139,7 +139,7 @@ def contact_sheet(cells: list[tuple[Path, Record]]) -> np.ndarray:
 def strip(folder: Path) -> np.ndarray:
     """Eight evenly spaced frames of an episode, with keypoints, over the robot alone: [h w 3] uint8."""
     rgb, states = read_video(folder / "rgb.mkv"), read_states(folder)
-    is_known = "robot" in read_record(folder).hashes  # an imported episode may be without
+    is_known = "robot" in read_record(folder).hashes  # imported episodes may have none
     robot = read_video(folder / "robot.mkv") if is_known else np.full_like(rgb, 255)
     frames = np.linspace(0, len(rgb) - 1, STRIP_FRAMES).round().astype(int)
     marked = [_mark_robot(rgb[t], states.keypoints[t][states.keypoint_visible[t]], states.robot_mask[t]) for t in frames]
@@ -156,13 +156,13 @@ def _mark_robot(image: np.ndarray, keypoints: np.ndarray, mask: np.ndarray) -> n
 
 
 def tile(rows: list[list[np.ndarray]]) -> np.ndarray:
-    """Rows of equal pictures [h w 3] uint8 as one, white between them."""
+    """Rows of equal pictures [h w 3] uint8 as one picture with white gaps."""
     padded = [[np.pad(image, ((0, GAP), (0, GAP), (0, 0)), constant_values=255) for image in row] for row in rows]
     return np.concatenate([np.concatenate(row, 1) for row in padded])
 
 
 def save_png(path: Path, image: np.ndarray) -> None:
-    """Write an image [h w 3] uint8 RGB. Raises EpisodeError where it cannot be written."""
+    """Write an image [h w 3] uint8 RGB. Raises EpisodeError if it cannot be written."""
     try:
         write_bytes(path, encode_png(image))
     except OSError as error:

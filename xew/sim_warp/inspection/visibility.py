@@ -52,19 +52,16 @@ def visibility_section(found: Found) -> str:
 
 def _introduction(found: Found, of_robot: Mapping[tuple[str, str], _Share], of_thing: Mapping[tuple[str, str], _Share]) -> str:
     """What the table shows, and in how many cells the aims are met."""
+    count = sum(map(len, found.values()))
+    episodes = f"{count} episode{'s' * (count != 1)}"
     points = [np.concatenate([one.robot.points for one in several]).mean() for several in found.values()]
     met = [sum(share.share >= aim for share in of.values()) for of, aim in ((of_robot, ROBOT_SHARE), (of_thing, THING_SHARE))]
     return (
         f"Share of frames [%] with at least {NEEDED_OF_ROBOT} visible points of the robot / share of the moving frames of the "
-        f"object that is seen least, with at least {NEEDED_OF_THING} visible points of it; {_count_episodes(found)}.\nThe aims "
+        f"object that is seen least, with at least {NEEDED_OF_THING} visible points of it; {episodes}.\nThe aims "
         f"are {100 * ROBOT_SHARE:.0f} and {100 * THING_SHARE:.0f}. The first is met in {met[0]} of {len(found)} cells, with "
         f"{min(points):.0f} to {max(points):.0f} points in the mean, the second in {met[1]}."
     )
-
-
-def _count_episodes(found: Found) -> str:
-    count = sum(map(len, found.values()))
-    return f"{count} episode{'s' * (count != 1)}"
 
 
 def _below_lines(of_robot: Mapping[tuple[str, str], _Share], of_thing: Mapping[tuple[str, str], _Share]) -> Iterator[str]:

@@ -1,8 +1,4 @@
-"""The expert: joint commands that follow a plan's tool path, by inverse kinematics, for any robot.
-
-Reads  ToolPath, RobotSpec
-Writes `Commands`: canonical joint targets at every stored frame, or the finding that this robot cannot follow
-"""
+"""The expert: joint commands that follow a plan's tool path, by inverse kinematics, for any robot."""
 
 from dataclasses import dataclass
 
@@ -21,22 +17,16 @@ ROTATION_TOLERANCE = 0.03
 
 @dataclass(frozen=True)
 class Commands:
-    """Joint commands of a robot, or why there are none."""
+    """Joint commands of a robot for one plan."""
 
     action: np.ndarray
     """[t 16] float32 canonical joint targets [rad] and grippers [0 closed, 1 open] at every stored frame."""
     problem: str | None
-    """Reason for which this robot cannot follow the plan, in words; None if it can."""
+    """Reason why this robot cannot follow the plan, in words; None if it can."""
 
 
 def joint_commands(robot: RobotSpec, paths: list[ToolPath], device: str | None = None) -> list[Commands]:
-    """Joint commands [t 16] of one robot for many plans, solved together: each frame near the one before it, from home on.
-
-    Args:
-        robot: whose commands.
-        paths: tool paths of the plans.
-        device: Warp's name of the device that solves; its default if left out.
-    """
+    """Joint commands [t 16] of a robot for many tool paths, solved together on a device; each frame near the previous one."""
     longest = max(path.frame_count for path in paths)
     targets = np.stack([_extend_path(path.pose, longest) for path in paths], 1).reshape(longest, -1, 7)
     arms = np.tile([LEFT, RIGHT], len(paths))
@@ -52,7 +42,7 @@ def joint_commands(robot: RobotSpec, paths: list[ToolPath], device: str | None =
 
 
 def _extend_path(pose: np.ndarray, frames: int) -> np.ndarray:
-    """A path [t 2 7] that stands at its last pose until it has `frames` frames."""
+    """A path [t 2 7] extended to `frames` frames at its last pose."""
     return np.concatenate([pose, np.repeat(pose[-1:], frames - len(pose), 0)])
 
 
@@ -66,7 +56,7 @@ def canonical_commands(joint_pos: np.ndarray, gripper: np.ndarray) -> np.ndarray
 
 
 def find_unreached(position: np.ndarray, rotation: np.ndarray, times: np.ndarray | None = None) -> str | None:
-    """Words for tool errors [t 2] m and rad beyond the tolerance, from when on if the times [t] s are given."""
+    """Description of tool errors [t 2] m and rad beyond the tolerance, with their first time if times [t] s are given."""
     for arm, side in enumerate(("left", "right")):
         beyond = (position[:, arm] > POSITION_TOLERANCE) | (rotation[:, arm] > ROTATION_TOLERANCE)
         if beyond.any():
@@ -77,7 +67,7 @@ def find_unreached(position: np.ndarray, rotation: np.ndarray, times: np.ndarray
 
 
 def find_too_fast(robot: RobotSpec, action: np.ndarray) -> str | None:
-    """Words for commands [t 16] that turn a joint faster than its limit."""
+    """Description of commands [t 16] that turn a joint faster than its limit."""
     speed = np.abs(np.diff(action, axis=0)) * FRAME_RATE
     limit = np.array(robot.joint_velocity)
     for side, (joints, _) in zip(("left", "right"), ARMS, strict=True):

@@ -1,7 +1,7 @@
-"""Where a robot's links and tools are: forward kinematics, a pure function of joint positions.
+"""Forward kinematics of a robot's links and tools, pure functions of joint positions.
 
-Poses are x y z [m] and quaternion x y z w. `forward_kinematics` is the kernel of batched_kinematics.py, which also takes and
-gives device arrays; all else here is NumPy, so that what the renderer is given is the same bits on every device.
+Poses are x y z [m] and quaternion x y z w. `forward_kinematics` runs the kernel of batched.py. All other functions are NumPy:
+the renderer gets the same bits on every device.
 """
 
 import numpy as np
@@ -26,21 +26,20 @@ def forward_kinematics(robot: RobotSpec | Urdf, joint_pos: np.ndarray) -> dict[s
     Raises:
         ValueError: `joint_pos` does not have one column per moving joint.
     """
-    # Only here, so that the rooms that need a robot's geometry and no simulation do without Warp.
+    # Imported here: packages that need a robot's geometry without simulation work without Warp.
     import warp as wp
 
     from xew.sim_warp.kinematics.batched import BatchedKinematics
 
     urdf = robot if isinstance(robot, Urdf) else load_urdf(robot.urdf)
     rows = _check_rows(urdf, joint_pos)
-    batched = BatchedKinematics.of_urdf(urdf, dtype=wp.float64)
+    batched = BatchedKinematics(urdf, dtype=wp.float64)
     poses = batched.poses(wp.array(rows, dtype=wp.float64, device=batched.device)).numpy()
-    found = {link: poses[:, number] for number, (_, link) in enumerate(batched.links[0])}
-    return {name: np.ascontiguousarray(found[name]) for name in urdf.links}
+    return {name: np.ascontiguousarray(poses[:, batched.links.index(name)]) for name in urdf.links}
 
 
 def _check_rows(urdf: Urdf, joint_pos: np.ndarray) -> np.ndarray:
-    """joint_pos as float64 [n j]."""
+    """`joint_pos` as float64 [n j]."""
     joint_pos = np.asarray(joint_pos, float)
     if joint_pos.ndim != 2 or joint_pos.shape[1] != len(urdf.joint_names):
         raise ValueError(
@@ -51,7 +50,7 @@ def _check_rows(urdf: Urdf, joint_pos: np.ndarray) -> np.ndarray:
 
 
 def link_matrices(urdf: Urdf, joint_pos: np.ndarray) -> dict[str, np.ndarray]:
-    """As `forward_kinematics`, but in NumPy and as homogeneous transforms [n 4 4]."""
+    """As `forward_kinematics`, in NumPy and as homogeneous transforms [n 4 4]."""
     joint_pos = _check_rows(urdf, joint_pos)
     column = {name: index for index, name in enumerate(urdf.joint_names)}
     frames = {urdf.root: np.tile(np.eye(4), (len(joint_pos), 1, 1))}
@@ -64,7 +63,7 @@ def link_matrices(urdf: Urdf, joint_pos: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def joint_motion(joint: Joint, position: np.ndarray) -> np.ndarray:
-    """[n 4 4] motion of a joint's child frame at positions [n]."""
+    """[n 4 4] motion of a joint's child frame at positions [n] rad or m."""
     motion = np.tile(np.eye(4), (len(position), 1, 1))
     if joint.kind == "prismatic":
         motion[:, :3, 3] = position[:, None] * joint.axis
@@ -85,7 +84,7 @@ def tool_poses(robot: RobotSpec, action: np.ndarray) -> np.ndarray:
 
 
 def tool_matrix(robot: RobotSpec, arm: int, arm_pos: np.ndarray) -> np.ndarray:
-    """As `tool_pose`, but [n 4 4]; other joints on the way to the tool stay at 0."""
+    """As `tool_pose`, as transforms [n 4 4]; joints that are not the arm's stay at 0."""
     side = robot.arms[arm]
     frame = np.tile(matrix_from_pose(side.root_pose), (len(arm_pos), 1, 1))
     for joint in load_urdf(robot.urdf).chain(side.tool_link):
@@ -96,15 +95,10 @@ def tool_matrix(robot: RobotSpec, arm: int, arm_pos: np.ndarray) -> np.ndarray:
 
 
 def joint_positions(robot: RobotSpec, action: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Positions of all URDF joints from canonical 16-number rows (`xew.protocol`).
-
-    Args:
-        robot: a robot of the registry.
-        action: [n 16], joints [rad] and grippers [0 closed, 1 open].
+    """Positions of all URDF joints at canonical rows `action` [n 16] (joints in rad, grippers 0 closed to 1 open).
 
     Returns:
-        One [n j] per copy of the URDF: one where it holds both arms, else the left and the right. Joints that are
-        of neither arm nor gripper are at 0.
+        One [n j] per copy of the URDF: one if it holds both arms, else left and right. Other joints are at 0.
     """
     names = load_urdf(robot.urdf).joint_names
     sides = []

@@ -1,8 +1,7 @@
-"""Tool poses to joint positions: batched Levenberg-Marquardt of newton.ik, on the CPU or a GPU.
+"""Inverse kinematics: batched Levenberg-Marquardt of newton.ik, on the CPU or a GPU.
 
-Every arm is posed as seven joints (six-joint arms get a last one that moves nothing), so that one set of kernels, and on a
-GPU one recording of their launches, serves all robots. Arms that differ by their bases alone are solved together; those that
-mirror each other each for itself.
+Every arm has seven joints (six-joint arms get a fixed last one): one set of kernels, and on a GPU one CUDA graph, serves all
+robots. Arms that differ only by their bases are solved together, mirrored arms separately.
 """
 
 from dataclasses import dataclass
@@ -21,47 +20,43 @@ from xew.sim_warp.kinematics.forward import tool_matrix
 
 JOINT_COUNT = 7
 POSITION_WEIGHT = 4.0
-"""Weight of a position residual: 1 m counts as much as 4 rad, so that near a pose both converge at the same pace."""
+"""Weight of a position residual: 1 m counts as much as 4 rad."""
 LIMIT_WEIGHT = 2.0
 POSTURE_WEIGHT = 0.01
-"""Weight of the pull of a seven-joint arm toward the mean of its two homes, so that its elbow does not drift."""
+"""Weight that pulls a seven-joint arm toward the mean of its two homes, against drift of the elbow."""
 POLISH_STEPS = 4
-"""Number of last steps without that pull, so that it does not move the tool."""
+"""Number of last steps without that weight."""
 ANCHOR_STRIDE = 8
-"""Number of frames from one pose of a path that is solved after the one before to the next; those between are solved at once.
-"""
-
+"""Number of frames between poses of a path that are solved one after another; the frames between them are solved at once."""
 LARGEST_BATCH = 1024
-"""Largest number of poses that a CPU solves in a call: more gain nothing there, and a batch is filled up to a power of two."""
+"""Largest number of poses per call on a CPU; batches are filled up to a power of two."""
 
 
 @dataclass(frozen=True)
 class Solution:
-    """Joint positions that bring tools where they should be, and how far from it they end."""
+    """Joint positions for tool poses, with their errors."""
 
     joint_pos: np.ndarray
     """[... d] float64, rad, inside the robot's limits."""
     position_error: np.ndarray
-    """[...] m, distance between the wanted and the reached tool frame."""
+    """[...] m, distance between the target and the reached tool frame."""
     rotation_error: np.ndarray
     """[...] rad, angle between them."""
 
 
 class ArmSolver:
-    """Inverse kinematics of one robot's arms; made once, called for every frame or path."""
+    """Inverse kinematics of one robot's arms.
+
+    Args:
+        robot: the robot.
+        device: Warp's name of the device, None for its default.
+        iterations: Levenberg-Marquardt steps per call.
+        posture_weight: weight that pulls a seven-joint arm toward the mean of its homes; 0 if there are no homes yet.
+    """
 
     def __init__(
         self, robot: RobotSpec, device: str | None = None, iterations: int = 24, posture_weight: float = POSTURE_WEIGHT
     ) -> None:
-        """Prepare a solver.
-
-        Args:
-            robot: whose arms.
-            device: Warp's name of the device; its default if left out.
-            iterations: Levenberg-Marquardt steps a call.
-            posture_weight: weight of a seven-joint arm's pull toward the mean of its homes; 0 where there are no homes yet.
-
-        """
         self.robot = robot
         self.iterations = iterations
         self.posture_weight = posture_weight if robot.arm_joint_count == JOINT_COUNT else 0.0
@@ -77,34 +72,25 @@ class ArmSolver:
 
         Args:
             arm: 0 (left) or 1 (right), one for all or [n].
-            tool_pose: [n 7], wanted pose of the tool frame in the world.
-            seed: [n d], where the search starts [rad].
+            tool_pose: [n 7], target poses of the tool frame in the world.
+            seed: [n d], start of the search [rad].
 
         Returns:
-            Solution of [n ...]. A pose out of reach gives the nearest found, with the errors that it has.
+            Solution of [n ...], for a pose out of reach the nearest solution with its errors.
         """
         arm = np.broadcast_to(arm, len(tool_pose))
         joint_pos = self._nearest(arm, self._in_base(arm, tool_pose), seed)
-        return Solution(joint_pos, *self._errors(arm, tool_pose, joint_pos))
+        return Solution(joint_pos, *_pose_errors(self._reached(arm, joint_pos), tool_pose))
 
     def solve_in_base(self, arm: np.ndarray, tool_pose: np.ndarray, seed: np.ndarray) -> Solution:
-        """As `solve`, for poses [n 7] in the frame in which an arm's first joint turns, wherever each stands."""
+        """As `solve`, for poses [n 7] in the frame in which an arm's first joint turns."""
         side = arm if len(self.models) > 1 else np.zeros_like(arm)
         joint_pos = self._nearest(side, tool_pose, seed)
         reached = np.linalg.inv(self.base)[side] @ self._reached(side, joint_pos)
         return Solution(joint_pos, *_pose_errors(reached, tool_pose))
 
     def solve_path(self, arm: int | np.ndarray, tool_pose: np.ndarray, start: np.ndarray) -> Solution:
-        """Joint positions along paths of the tool, each frame near the one before it.
-
-        Args:
-            arm: 0 (left) or 1 (right), one for all or [n].
-            tool_pose: [t n 7], wanted poses.
-            start: [n d], joint positions before the first frame.
-
-        Returns:
-            Solution of [t n ...].
-        """
+        """Solution [t n ...] along paths of the tool [t n 7], from joint positions `start` [n d] rad, for arms [n]."""
         frames, count = tool_pose.shape[:2]
         arms = np.tile(np.broadcast_to(arm, count), frames)
         poses = tool_pose.reshape(-1, 7)
@@ -116,7 +102,7 @@ class ArmSolver:
             start = at_anchor[index] = self._nearest(arms[rows], targets[rows], start)
         seed = _interpolate(np.arange(frames), anchors, at_anchor)
         joint_pos = self._nearest(arms, targets, seed.reshape(frames * count, -1))
-        position, rotation = self._errors(arms, poses, joint_pos)
+        position, rotation = _pose_errors(self._reached(arms, joint_pos), poses)
         return Solution(joint_pos.reshape(seed.shape), position.reshape(frames, count), rotation.reshape(frames, count))
 
     def _in_base(self, arm: np.ndarray, tool_pose: np.ndarray) -> np.ndarray:
@@ -127,10 +113,10 @@ class ArmSolver:
         """[n d] joint positions of arms [n] for poses [n 7] in their bases, found from seeds [n d]."""
         if len(self.models) == 1:
             return self._solve(0, target, seed)
-        found = np.empty(seed.shape)
+        joint_pos = np.empty(seed.shape)
         for side in np.unique(arm).tolist():
-            found[arm == side] = self._solve(side, target[arm == side], seed[arm == side])
-        return found
+            joint_pos[arm == side] = self._solve(side, target[arm == side], seed[arm == side])
+        return joint_pos
 
     def _solve(self, number: int, target: np.ndarray, seed: np.ndarray) -> np.ndarray:
         """As `_nearest`, for the arms of one model."""
@@ -141,9 +127,6 @@ class ArmSolver:
         problems = _problems(self.device.alias, seed.shape[1], size, self.iterations, self.posture_weight)
         problems.set_arm(self.models[number])
         return np.clip(problems.solve(target, seed), self.lower, self.upper)
-
-    def _errors(self, arm: np.ndarray, tool_pose: np.ndarray, joint_pos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return _pose_errors(self._reached(arm, joint_pos), tool_pose)
 
     def _reached(self, arm: np.ndarray, joint_pos: np.ndarray) -> np.ndarray:
         """[n 4 4] world poses of the tool frames of arms [n] at joint positions [n d]."""
@@ -162,7 +145,7 @@ def _pose_errors(reached: np.ndarray, wanted: np.ndarray) -> tuple[np.ndarray, n
 
 @lru_cache(maxsize=128)
 def arm_solver(robot: RobotSpec, device: str | None = None) -> ArmSolver:
-    """The process's solver of a robot on a device of Warp's, or on its default one; made at first use."""
+    """The process's solver of a robot on a device, created at first use."""
     return ArmSolver(robot, device)
 
 
@@ -192,7 +175,7 @@ def arm_bases(robot: RobotSpec) -> np.ndarray:
 
 
 def _are_alike(robot: RobotSpec) -> bool:
-    """Do the arms differ by their bases alone?"""
+    """Whether the arms differ only by their bases."""
     joints = load_urdf(robot.urdf).joints
     left, right = (_segments(robot, arm) for arm in robot.arms)
     axes, others = ([joints[name].axis for name in arm.joints] for arm in robot.arms)
@@ -201,23 +184,23 @@ def _are_alike(robot: RobotSpec) -> bool:
 
 @dataclass(frozen=True)
 class _SevenJoints:
-    """An arm from its first joint on, posed as seven joints; those that it has not move nothing."""
+    """An arm from its first joint on, with seven joints; added joints do not move."""
 
     parents: np.ndarray
-    """[7 7] poses of the joints in the links before them, xyz [m] and quaternion xyzw."""
+    """[7 7] poses of the joints in their parent links, xyz [m] and quaternion xyzw."""
     axes: np.ndarray
-    """[7 3] axes of the joints, of length 1."""
+    """[7 3] unit axes of the joints."""
     children: np.ndarray
-    """[7 7] poses of the joints in the links behind them; the last real link's frame is thus the tool's."""
+    """[7 7] poses of the joints in their child links; the frame of the last real link is the tool frame."""
     lower: np.ndarray
     upper: np.ndarray
     """[7] limits [rad]."""
     home: np.ndarray
-    """[7] posture that a seven-joint arm is pulled toward [rad]."""
+    """[7] posture of the posture weight [rad]."""
 
 
 def _pose_as_seven(robot: RobotSpec, arm: Arm, home: np.ndarray) -> _SevenJoints:
-    """An arm of a robot, and the posture [d] rad that it is pulled toward, as seven joints."""
+    """An arm of a robot and its posture [d] rad as seven joints."""
     segments = _segments(robot, arm)
     count = len(arm.joints)
     parents = np.tile(pose_from_matrix(np.eye(4)), (JOINT_COUNT, 1))
@@ -233,15 +216,12 @@ def _pose_as_seven(robot: RobotSpec, arm: Arm, home: np.ndarray) -> _SevenJoints
 
 @lru_cache(maxsize=64)
 def _problems(device: str, joints: int, size: int, iterations: int, posture_weight: float) -> "_Problems":
-    """The process's problems of one kind, which serve all arms of so many joints."""
+    """The process's problems for all arms with a number of joints."""
     return _Problems(device, joints, size, iterations, posture_weight)
 
 
 class _Problems:
-    """A fixed number of problems of one arm, whichever it is, with their buffers and, on a GPU, their captured graph.
-
-    What tells arms apart lies in arrays that the graph reads, so that no arm needs a graph of its own.
-    """
+    """A fixed number of problems of one arm, with buffers and, on a GPU, a captured graph that serves all arms."""
 
     def __init__(self, device: str, joints: int, size: int, iterations: int, posture_weight: float) -> None:
         self.model = _chain(device)
@@ -268,7 +248,7 @@ class _Problems:
         self.graph: wp.Graph | None = None
 
     def set_arm(self, arm: _SevenJoints) -> None:
-        """Make the problems those of an arm."""
+        """Write an arm's parameters into the arrays of the problems."""
         if arm is self.arm:
             return
         model = self.model
@@ -284,7 +264,7 @@ class _Problems:
         self.arm = arm
 
     def solve(self, target: np.ndarray, seed: np.ndarray) -> np.ndarray:
-        """Joint positions [n d] for tool poses [n 7] in the arm's base frame; n may be less than the size."""
+        """Joint positions [n d] for tool poses [n 7] in the arm's base frame, n at most the size."""
         count, joints = seed.shape
         self.positions.assign(_pad(target[:, :3], self.positions.shape[0]))
         self.rotations.assign(_pad(target[:, 3:], self.positions.shape[0]))
@@ -296,7 +276,7 @@ class _Problems:
         return self.joint_pos.numpy()[:count, :joints].astype(float)
 
     def _run(self) -> None:
-        """All steps; on a GPU the first run loads the kernels, the second records them, later ones replay."""
+        """Run all steps; on a GPU the first run loads the kernels, the second records a graph, later ones replay it."""
         if not self.device.is_cuda or not self.has_run:
             self._step()
             self.has_run = True
@@ -314,7 +294,7 @@ class _Problems:
 
 
 def _chain(device: str) -> "newton.Model":
-    """Seven joints one after another, each where the one before it is."""
+    """A chain of seven joints at the origin."""
     builder = newton.ModelBuilder()
     handles = [
         builder.add_joint_revolute(

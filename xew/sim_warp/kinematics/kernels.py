@@ -1,6 +1,6 @@
-"""Forward kinematics on a device: one thread a configuration walks the tree of joints from the root outward.
+"""Forward kinematics on a device: one thread per configuration walks the tree of joints from the root outward.
 
-A pose is that of a link, `above` its parent: pose = pose[above] * origin * motion(gain * joint_pos[column] + bias).
+The pose of a link follows from the pose of its parent, `above`: pose = pose[above] * origin * motion(joint_pos[column]).
 """
 
 # Annotations of kernels are types of Warp, which mypy does not know.
@@ -29,62 +29,50 @@ def normalize_rotation(
 
 @cache
 def kinematics_kernels(scalar: type) -> SimpleNamespace:
-    """The kernel for `wp.float32` or `wp.float64`, with the `Forest` that it reads and the types of its arrays."""
+    """The kernel for `wp.float32` or `wp.float64`, with the `Tree` that it reads and the types of its arrays."""
     vector, rotation, frame = TYPES[scalar]
 
     @wp.struct
-    class Forest:
-        """The links of several robots end to end, each robot's parents before their children."""
+    class Tree:
+        """The links of a robot, parents before their children."""
 
-        links: wp.array(dtype=wp.vec2i)  # [r] int32, first link and number of links of a robot
-        above: wp.array(dtype=int)  # [l] int32, the link above, counted within the robot; -1 for the world
+        above: wp.array(dtype=int)  # [l] int32, the parent link; -1 for none
         kind: wp.array(dtype=int)  # [l] int32, FIXED, TURNING or SLIDING
         origin: wp.array(dtype=frame)  # [l] m and quaternion x y z w, the link in the one above at joint position 0
         axis: wp.array(dtype=vector)  # [l] unit vector in the frame of the link
-        column: wp.array(dtype=int)  # [l] int32, of joint_pos
-        gain: wp.array(dtype=scalar)  # [l] rad or m for 1 of joint_pos
-        bias: wp.array(dtype=scalar)  # [l] rad or m
+        column: wp.array(dtype=int)  # [l] int32, column of joint_pos
 
     @wp.kernel(module="unique")
     def forward_kinematics(
         # In
-        forest: Forest,  # links of all robots
-        robot: wp.array(dtype=int),  # [n] int32, number of the row's robot; [0] where there is one robot
-        joint_pos: wp.array2d(dtype=scalar),  # [n j] float32 or float64, rad or m, or canonical rows
+        tree: Tree,  # links of the robot
+        joint_pos: wp.array2d(dtype=scalar),  # [n j] float32 or float64, rad or m
         # Out
-        pose_out: wp.array3d(dtype=scalar),  # [l 7 n] as joint_pos, m and quaternion x y z w; threads write side by side
+        pose_out: wp.array3d(dtype=scalar),  # [l 7 n] as joint_pos, m and quaternion x y z w; threads write adjacent numbers
     ):
         """Walk the links of one configuration from the root outward: a thread makes the poses [l 7] of one row of [n]."""
         row = wp.tid()
-        which = 0
-        if robot.shape[0] > 0:
-            which = robot[row]
-        first = forest.links[which][0]
         place = vector(scalar(0.0))
         turn = wp.quat_identity(dtype=scalar)
-        for local in range(forest.links[which][1]):
-            link = first + local
-            above = forest.above[link]
-            if above < 0:
-                place = vector(scalar(0.0))
-                turn = wp.quat_identity(dtype=scalar)
-            elif above != local - 1:
+        for link in range(tree.above.shape[0]):
+            above = tree.above[link]
+            if above != link - 1:
                 place = vector(pose_out[above, 0, row], pose_out[above, 1, row], pose_out[above, 2, row])
                 turn = rotation(
                     pose_out[above, 3, row], pose_out[above, 4, row], pose_out[above, 5, row], pose_out[above, 6, row]
                 )
-            place += wp.quat_rotate(turn, wp.transform_get_translation(forest.origin[link]))
-            turn = turn * wp.transform_get_rotation(forest.origin[link])
-            if forest.kind[link] != wp.static(FIXED):
-                position = forest.gain[link] * joint_pos[row, forest.column[link]] + forest.bias[link]
-                if forest.kind[link] == wp.static(TURNING):
-                    turn = turn * wp.quat_from_axis_angle(forest.axis[link], position)
+            place += wp.quat_rotate(turn, wp.transform_get_translation(tree.origin[link]))
+            turn = turn * wp.transform_get_rotation(tree.origin[link])
+            if tree.kind[link] != wp.static(FIXED):
+                position = joint_pos[row, tree.column[link]]
+                if tree.kind[link] == wp.static(TURNING):
+                    turn = turn * wp.quat_from_axis_angle(tree.axis[link], position)
                 else:
-                    place += wp.quat_rotate(turn, forest.axis[link] * position)
+                    place += wp.quat_rotate(turn, tree.axis[link] * position)
             turn = normalize_rotation(turn)
             for i in range(3):
-                pose_out[local, i, row] = place[i]
+                pose_out[link, i, row] = place[i]
             for i in range(4):
-                pose_out[local, 3 + i, row] = turn[i]
+                pose_out[link, 3 + i, row] = turn[i]
 
-    return SimpleNamespace(Forest=Forest, forward_kinematics=forward_kinematics, vector=vector, frame=frame)
+    return SimpleNamespace(Tree=Tree, forward_kinematics=forward_kinematics, vector=vector, frame=frame)

@@ -1,11 +1,8 @@
-"""Motion of its own: a robot goes between a plan's waypoints as its own planner would take it, in its own time.
+"""Own motion: a robot moves between a plan's waypoints as its own planner would, in its own time.
 
-Reads  Timelines, RobotSpec
-Writes for each the robot's own `ToolPath` and `Commands`, or the finding that this robot cannot follow
-
-Where the task does not ask for a line of the tool, an arm goes straight in its joints, from its own rest on. Each move takes
-the time that the slowest joint of either arm needs at a share of its speed and acceleration; moves along a line take at least
-the time of the plan, too. Both arms begin and end a move together, so that what the plan has meet meets.
+Unless the task needs a straight tool line, an arm moves straight in joint space, from its own rest. Each move takes the time
+that the slowest joint of either arm needs at a share of its speed and acceleration limits. A move along a tool line takes at
+least the plan's time. Both arms begin and end a move together.
 """
 
 from collections.abc import Sequence
@@ -22,20 +19,20 @@ from xew.sim_warp.kinematics.inverse import ANCHOR_STRIDE, arm_solver
 from xew.sim_warp.plan import HOME, LEFT, RIGHT, SHORTEST_MOVE, Segment, Timeline, ToolPath, frame_times, minimum_jerk
 
 SPEED_SHARE = 0.3
-"""Share of its speed and acceleration limits at which a robot moves; drivers of real arms begin with .1 to .3 of them."""
+"""Share of a robot's speed and acceleration limits; drivers of real arms start with 0.1 to 0.3."""
 SAMPLES = 4 * ANCHOR_STRIDE
-"""Number of intervals into which a move is cut for inverse kinematics. A multiple of the solver's stride, so that a plan has
-the same anchors, and the same joints to the last bit, beside longer plans."""
+"""Number of intervals of a move for inverse kinematics. A multiple of the solver's stride: a plan has the same anchors, and the
+same joints to the last bit, in a batch with longer plans."""
 _SHARES = np.linspace(0, 1, 129)
-"""Instants of a move, as shares of its time, at which its speeds and accelerations are looked at."""
+"""Instants of a move, as shares of its time, at which speeds and accelerations are evaluated."""
 
 Step = dict[int, Segment]
-"""One move: the segments of the arms that have a part in it."""
+"""One move: the segments of the moving arms."""
 
 
 @dataclass(frozen=True)
 class _Move:
-    """One move of a robot: where the joints of each arm go, and when in its own time."""
+    """One move of a robot: joint courses and times on its own clock."""
 
     start: float
     """Begin [s]."""
@@ -45,28 +42,20 @@ class _Move:
 
 
 def own_commands(robot: RobotSpec, timelines: Sequence[Timeline], device: str | None = None) -> list[tuple[ToolPath, Commands]]:
-    """A robot's own paths and joint commands [t 16] for many plans, solved together.
-
-    They are the same bits whatever is solved beside them.
-
-    Args:
-        robot: whose commands.
-        timelines: the plans.
-        device: Warp's name of the device that solves; its default if left out.
-    """
+    """A robot's own paths and joint commands [t 16] for many plans, solved together; bits do not depend on the batch."""
     longest = max(len(timeline.steps) for timeline in timelines) * SAMPLES + 1
     targets = np.stack([_lines(timeline.steps, longest) for timeline in timelines], 1).reshape(longest, -1, 7)
     arms = np.tile([LEFT, RIGHT], len(timelines))
     solution = arm_solver(robot, device).solve_path(arms, targets, np.array([robot.arms[arm].home for arm in arms]))
-    found = []
+    motions = []
     for index, timeline in enumerate(timelines):
         columns = slice(2 * index, 2 * index + 2)
         asked = _asked_rows(timeline.steps, longest)
         path, action = _follow(robot, timeline, solution.joint_pos[:, columns])
         far = (np.where(asked, error[:, columns], 0.0) for error in (solution.position_error, solution.rotation_error))
         problem = find_unreached(*far) or find_too_fast(robot, action)
-        found.append((path, Commands(action.astype(np.float32), problem)))
-    return found
+        motions.append((path, Commands(action.astype(np.float32), problem)))
+    return motions
 
 
 def _follow(robot: RobotSpec, timeline: Timeline, joint_pos: np.ndarray) -> tuple[ToolPath, np.ndarray]:
@@ -76,7 +65,7 @@ def _follow(robot: RobotSpec, timeline: Timeline, joint_pos: np.ndarray) -> tupl
     planned, own = np.array(clock).T
 
     def in_own_time(instants: ArrayLike) -> np.ndarray:
-        """Instants of the robot's own time at which those of the plan come [s]."""
+        """Instants of the plan on the robot's own clock [s]."""
         return np.interp(np.asarray(instants, float), planned, own)
 
     times = frame_times(clock[-1][1])
@@ -91,9 +80,8 @@ def _follow(robot: RobotSpec, timeline: Timeline, joint_pos: np.ndarray) -> tupl
 
 
 def _lines(steps: Sequence[Step], rows: int) -> np.ndarray:
-    """[rows 2 7] poses of both tools along the straight lines of all moves, `SAMPLES` rows each; then they stand."""
-    at = np.stack([np.concatenate([home.position, home.rotation.as_quat()]) for home in HOME])
-    poses = np.tile(at, (rows, 1, 1))
+    """[rows 2 7] poses of both tools along the straight lines of all moves, `SAMPLES` rows each, then at rest."""
+    poses = np.tile([home.pose for home in HOME], (rows, 1, 1))
     progress = np.linspace(0, 1, SAMPLES + 1)
     for number, step in enumerate(steps):
         for arm, segment in step.items():
@@ -104,7 +92,7 @@ def _lines(steps: Sequence[Step], rows: int) -> np.ndarray:
 
 
 def _asked_rows(steps: Sequence[Step], rows: int) -> np.ndarray:
-    """[rows 2] bool, whether a tool must be at its row of `_lines`: all along a line, else at the end of each move."""
+    """[rows 2] bool, whether a tool must reach its row of `_lines`: all along a line, else at the end of each move."""
     asked = np.zeros((rows, 2), bool)
     for number, step in enumerate(steps):
         first, last = number * SAMPLES, (number + 1) * SAMPLES
@@ -114,7 +102,7 @@ def _asked_rows(steps: Sequence[Step], rows: int) -> np.ndarray:
 
 
 def _keeps_line(steps: Sequence[Step], number: int, arm: int) -> bool:
-    """Whether an arm's tool keeps to its line in a move: not on its way from rest, unless that is a curve."""
+    """Whether an arm's tool follows its line in a move: not on its way from rest, unless that is a curve."""
     comes_from_rest = not any(arm in step for step in steps[:number])
     segment = steps[number][arm]
     return segment.is_curve or (segment.is_straight and not comes_from_rest)
@@ -123,10 +111,7 @@ def _keeps_line(steps: Sequence[Step], number: int, arm: int) -> bool:
 def _plan_moves(
     robot: RobotSpec, timeline: Timeline, begin: Sequence[np.ndarray], joint_pos: np.ndarray
 ) -> tuple[list[_Move], list[tuple[float, float]]]:
-    """The moves of one plan from joints `begin` on, and the pairs of its clock and the robot's own.
-
-    `joint_pos` [rows 2 d] rad solves `_lines`.
-    """
+    """The moves of one plan from joints `begin`, and pairs of instants on its and the robot's clock; `joint_pos` [rows 2 d]."""
     steps, at, moves, clock = timeline.steps, list(begin), list[_Move](), [(0.0, 0.0)]
     for number, step in enumerate(steps):
         rows = joint_pos[number * SAMPLES : (number + 1) * SAMPLES + 1]
@@ -146,13 +131,13 @@ def _plan_moves(
 
 
 def _begin(robot: RobotSpec, arm: int, steps: Sequence[Step], joint_pos: np.ndarray) -> np.ndarray:
-    """[d] joints of an arm when the episode begins: at rest, or where a curve begins that is its first move."""
+    """[d] initial joints of an arm: at rest, or at the begin of its first move if that is a curve."""
     first = next((step[arm] for step in steps if arm in step), None)
     return joint_pos[0, arm] if first is not None and first.is_curve else np.array(robot.arms[arm].rest or robot.arms[arm].home)
 
 
 def _shortest_time(robot: RobotSpec, course: CubicSpline) -> float:
-    """Least time of a minimum-jerk move along a course of the joints in which none exceeds its share of its limits [s]."""
+    """Least time of a minimum-jerk move along a joint course within the share of all limits [s]."""
     share = _SHARES[:, None]
     progress = minimum_jerk(share)
     slope = 30 * share**2 * (1 - share) ** 2

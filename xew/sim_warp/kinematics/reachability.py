@@ -1,8 +1,4 @@
-"""Whether an arm reaches tool poses from home, and the part of the table where tasks ask it to.
-
-Reads  an `ArmSolver` and tool poses
-Writes which of them are reached: along a straight path of the tool, inside the limits that experts keep, to 2 mm and 0.02 rad
-"""
+"""Reachability of tool poses from home along straight tool paths, within the experts' joint limits."""
 
 from itertools import product
 
@@ -15,7 +11,7 @@ from xew.sim_warp.kinematics.inverse import ArmSolver
 from xew.sim_warp.plan import tool
 
 WORK_X, WORK_Y, WORK_Z = np.linspace(-0.30, 0.10, 5), np.linspace(-0.20, 0.12, 5), np.array([0.765, 0.80, 0.88])
-"""Grid over the part of the left arm's work volume where tasks grasp and place [m]; the right arm's is its mirror image."""
+"""Grid over the left arm's work volume in tasks [m]; the right arm's is its mirror image."""
 GRASP_TILT = 30
 """Lean of the hand in the grasps of that grid [deg]."""
 RADIAL_OFFSETS = (-45, -22.5, 0, 22.5, 45)
@@ -27,16 +23,13 @@ POSITION_TOLERANCE, ROTATION_TOLERANCE = 2e-3, 0.02
 
 
 def reaches(solver: ArmSolver, arm: int, positions: np.ndarray, tilts: np.ndarray, yaws: np.ndarray) -> np.ndarray:
-    """Whether an arm reaches tool poses from home.
+    """[n] bool, whether an arm reaches tool poses from home.
 
     Args:
         solver: the robot's solver.
         arm: 0 (left) or 1 (right); positions and yaws are mirrored for the right arm.
-        positions: [n 3] m, world frame, as for the left arm.
+        positions: [n 3] m, world frame, for the left arm.
         tilts, yaws: [n] deg.
-
-    Returns:
-        [n] bool.
     """
     mirror = 1 - 2 * arm
     goals = [
@@ -56,11 +49,7 @@ def reaches(solver: ArmSolver, arm: int, positions: np.ndarray, tilts: np.ndarra
 
 
 def work_reach(robot: RobotSpec, arm: int) -> np.ndarray:
-    """Whether an arm reaches the grasps that tasks ask for: tilt 30 degrees, yaw up to 45 degrees off the radial one.
-
-    Returns:
-        [offsets x y z] bool over `RADIAL_OFFSETS`, `WORK_X`, `WORK_Y` and `WORK_Z`.
-    """
+    """[offsets x y z] bool over `RADIAL_OFFSETS`, `WORK_X`, `WORK_Y` and `WORK_Z`, whether an arm reaches the tasks' grasps."""
     cells = list(product(RADIAL_OFFSETS, product(WORK_X, WORK_Y, WORK_Z)))
     positions = np.array([position for _, position in cells])
     yaws = np.array([radial_yaw(np.array(position)) + offset for offset, position in cells])

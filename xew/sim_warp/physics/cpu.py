@@ -20,7 +20,7 @@ from xew.sim_warp.physics.worlds import (
     shape_owners,
 )
 
-# Warnings are counted in `data.warning` and reported as overflow; MuJoCo would also write them to a file in the user's folder.
+# Warnings are counted in `data.warning` and reported as overflow; by default MuJoCo also writes a log file.
 mujoco.set_mju_user_warning(lambda message: None)
 
 _ARMS = ((LEFT_FINGERS, LEFT_ARM_LINKS), (RIGHT_FINGERS, RIGHT_ARM_LINKS))
@@ -48,12 +48,12 @@ def simulate_one(world: World) -> Motion:
 
 
 Frame = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
-"""Joint coordinates [40] and velocities [37] of the template [rad, m], which fingers touch which objects [2 o] bool, depth of
-each object in something else [o] m, and depths of an arm in the table and of the arms in each other [2] m."""
+"""Joint coordinates [40] and velocities [37] of the template [rad, m], contacts of fingers and objects [2 o] bool, penetration
+of each object [o] m, and penetrations of an arm and the table and of the arms [2] m."""
 
 
 def _record_frame(data: mujoco.MjData, owners: np.ndarray, objects: int) -> Frame:
-    """What the engine knows of this instant; `owners` [s] int32 of all collision shapes."""
+    """The engine's current state; `owners` [s] int32 of all collision shapes."""
     distance = np.array(data.contact.dist) if data.ncon else np.zeros(0)
     pairs = np.sort(owners[data.contact.geom], axis=-1) if data.ncon else np.zeros((0, 2), int)
     touching = pairs[distance < 0]

@@ -1,6 +1,6 @@
-"""Physics on a GPU: MuJoCo Warp steps all worlds of a batch together, with one CUDA graph a stored frame.
+"""Physics on a GPU: MuJoCo Warp steps all worlds of a batch together, with one CUDA graph per stored frame.
 
-The same code runs on Warp's CPU device, slowly: that is how it is tested where there is no GPU.
+The same code runs on Warp's CPU device, slowly, for tests without a GPU.
 """
 
 from collections.abc import Sequence
@@ -29,17 +29,17 @@ from xew.sim_warp.physics.worlds import (
 
 CONTACTS_PER_WORLD = 160
 CONSTRAINTS_PER_WORLD = 768
-"""First sizes of MuJoCo Warp's buffers; worlds that overflow them are stepped again with twice as much."""
+"""Initial sizes of MuJoCo Warp's buffers, doubled for worlds that overflow."""
 ATTEMPTS = 3
-"""Number of times that a world is stepped at most."""
+"""Largest number of attempts per world."""
 SOLVER_LIMITS = mjw.OverflowType.ITERATIONS | mjw.OverflowType.LS_ITERATIONS
-"""Flags among MuJoCo Warp's overflows that mean no lost contact: a step whose solver used all of its iterations."""
+"""Overflow flags that lose no contact: the solver used all of its iterations."""
 
 
 def simulate_batch(worlds: Sequence[World], device: str | None = None, batch: int | None = None) -> list[Motion]:
-    """Step worlds `batch` at a time (None: all together); those whose buffers overflow once more, with larger ones.
+    """Step worlds `batch` at a time (None: all together), and worlds whose buffers overflow again with larger ones.
 
-    Kernels are compiled for a number of worlds: a last batch that is smaller is filled with worlds that are thrown away.
+    Kernels are compiled for a number of worlds: the last batch is filled up with copies, which are discarded.
     """
     size = batch or len(worlds)
     motions: dict[int, Motion] = {}
@@ -54,7 +54,7 @@ def simulate_batch(worlds: Sequence[World], device: str | None = None, batch: in
 
 
 class Batch:
-    """Worlds on the device, and what they have done so far."""
+    """Worlds on the device, with their recorded states."""
 
     def __init__(self, worlds: Sequence[World], device: wp.Device, scale: int = 1) -> None:
         self.worlds, self.device = worlds, device
@@ -63,7 +63,7 @@ class Batch:
         )
         self.model, self.data = self.solver.mjw_model, self.solver.mjw_data
         self.model.opt.timestep.fill_(TIME_STEP)
-        self.model.opt.warn_overflow = 0  # what overflows is stepped again, or reported in `Motion.overflow`
+        self.model.opt.warn_overflow = 0  # overflowing worlds are stepped again, or reported in `Motion.overflow`
         self.frame_count = max(len(world.action) for world in worlds)
         self.joints = self._array(np.stack([self._joints(world) for world in worlds]))
         self.owners = self._array(self._geom_owners(), wp.int32)
@@ -80,15 +80,15 @@ class Batch:
         self.overlap = self._array(np.zeros((len(worlds), 2)))
 
     def compile(self) -> None:
-        """Compile all that `run` launches, many kernels at once, where Warp would compile one after another."""
+        """Compile all kernels of `run` in parallel."""
         compile_together(self.list_kernels(), self.device)
 
     def list_kernels(self) -> list[Variant]:
         """The kernels that `run` launches."""
-        with wp.ScopedDevice(self.device), noted_launches() as found:
+        with wp.ScopedDevice(self.device), noted_launches() as variants:
             self._begin()
             self._step_frame()
-        return list(found)
+        return list(variants)
 
     def run(self) -> list[Motion]:
         """Step all worlds from their first command to the last of the longest."""
@@ -146,7 +146,7 @@ class Batch:
         return motions
 
     def _joints(self, world: World) -> np.ndarray:
-        """[t 18] commanded joints; a world that ends early stands at its last command."""
+        """[t 18] commanded joints, extended at the last command."""
         joints = template_joints(world.robot, world.action)
         return np.concatenate([joints, np.repeat(joints[-1:], self.frame_count - len(joints), 0)])
 

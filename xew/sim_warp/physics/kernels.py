@@ -1,7 +1,7 @@
-"""Warp kernels that run before and after MuJoCo Warp's step: they set targets, and record joints and contacts.
+"""Warp kernels before and after MuJoCo Warp's step: they set targets, and record joints and contacts.
 
-Letters of shapes: n worlds, t stored frames, q joint coordinates, v joint velocities, c contacts that the buffer holds,
-g collision shapes of a world, o objects.
+Letters of shapes: n worlds, t stored frames, q joint coordinates, v joint velocities, c contacts of the buffer, g collision
+shapes of a world, o objects.
 """
 
 # Annotations of kernels are types of Warp, which mypy does not know.
@@ -40,7 +40,7 @@ def record_joints(
     qpos_out: wp.array3d[wp.float32],  # [n t q] float32 [rad, m]
     qvel_out: wp.array3d[wp.float32],  # [n t v] float32 [rad/s, m/s]
 ):
-    """Record where the joints are and how fast they move."""
+    """Record joint coordinates and velocities."""
     world, index = wp.tid()
     if index < qpos.shape[1]:
         qpos_out[world, frame[0], index] = qpos[world, index]
@@ -50,7 +50,7 @@ def record_joints(
 
 @wp.func
 def side_of(owner: int) -> int:
-    """0 for any part of the left arm, 1 for the right, -1 for what is no robot."""
+    """0 for any part of the left arm, 1 for the right, -1 otherwise."""
     if owner == wp.static(LEFT_FINGERS) or owner == wp.static(LEFT_ARM_LINKS):
         return 0
     if owner == wp.static(RIGHT_FINGERS) or owner == wp.static(RIGHT_ARM_LINKS):
@@ -72,7 +72,7 @@ def record_contacts(
     penetration_out: wp.array3d[wp.float32],  # [n t o] float32 m, how deep an object and anything else are in each other
     overlap_out: wp.array2d[wp.float32],  # [n 2] float32 m, how deep an arm was in the table, and the arms in each other
 ):
-    """Record which fingers touch which objects and how deep things are in each other."""
+    """Record contacts of fingers and objects, and penetrations."""
     index = wp.tid()
     if index >= wp.min(count[0], geom.shape[0]) or distance[index] >= 0.0:
         return

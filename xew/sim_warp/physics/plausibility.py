@@ -1,9 +1,6 @@
-"""A check that a motion could have happened: soft contacts of a physics engine let things sink, fall and creep.
+"""Plausibility check of a motion: soft contacts of a physics engine let objects sink, fall and creep.
 
-Reads  what was recorded of an episode (poses, penetration), the scene, and when a hand should be holding what
-Writes the first thing that is implausible, in words, or nothing
-
-To use another limit, change the constants; `python -m xew.sim_warp.inspect --verify` holds accepted episodes to them.
+`python -m xew.sim_warp.inspect --verify` applies these limits to accepted episodes.
 """
 
 from collections.abc import Sequence
@@ -16,13 +13,13 @@ from xew.sim_warp.scene import Scene
 from xew.sim_warp.stage import TABLE_SIZE, TABLE_TOP
 
 DEEPEST = 0.005
-"""Depth to which an object and anything else may be in each other [m]."""
+"""Largest penetration of an object [m]."""
 DEEP_FRAMES = 3
-"""Number of frames in a row for which it may be deeper: a blow passes, a wall that has sunk into a finger stays."""
+"""Number of consecutive frames in which it may be deeper, as in a blow."""
 FARTHEST_CREEP = 0.010
-"""Distance that a held object may slip along the fingers between their closing and their opening [m]."""
+"""Largest slip of a held object along the fingers [m]."""
 BELOW_TABLE = 0.03
-"""Depth of an object's origin under the table's top from which it has fallen [m]."""
+"""Depth of an object's origin below the table's top at which it has fallen [m]."""
 
 
 def find_implausible(
@@ -34,13 +31,12 @@ def find_implausible(
     tool_pose: np.ndarray,
     frame_rate: float,
 ) -> str | None:
-    """The first thing that could not have happened, in words; None if all is well.
+    """The first implausible event in words, or None.
 
     Args:
-        holds: when a hand should have been holding which object [s].
         object_pose: [t o 7] xyz [m] and quaternion xyzw, world.
         penetration: [t o] m.
-        contact: [t 2 o] bool, which hand touches which object.
+        contact: [t 2 o] bool, contacts of hands and objects.
         tool_pose: [t 2 7] measured, xyz [m] and quaternion xyzw, world.
         frame_rate: Hz.
     """
@@ -53,7 +49,7 @@ def find_implausible(
 
 def _find_sunk(scene: Scene, penetration: np.ndarray, contact: np.ndarray, frame_rate: float) -> str | None:
     windows = np.lib.stride_tricks.sliding_window_view(penetration, min(DEEP_FRAMES + 1, len(penetration)), axis=0)
-    lasting = windows.min(-1).max(0)  # the depth that is exceeded for so many frames in a row
+    lasting = windows.min(-1).max(0)  # depth exceeded in all frames of a window
     worst = int(np.argmax(lasting))
     if lasting[worst] > DEEPEST:
         frame = int(np.argmax(windows.min(-1)[:, worst]))
@@ -63,10 +59,9 @@ def _find_sunk(scene: Scene, penetration: np.ndarray, contact: np.ndarray, frame
 
 
 def _name_partner(scene: Scene, index: int, penetration: np.ndarray, contact: np.ndarray) -> str:
-    """What an object has sunk into, from one frame's penetration [o] m and contact [2 o].
+    """The object or hand that an object has sunk into, from one frame's penetration [o] m and contact [2 o].
 
-    Depths are recorded an object, not a pair: another object that is as deep in something is the one; what a hand touches may
-    be in the hand or in what carries it.
+    Depths are recorded per object, not per pair: an object with an equal depth is the partner, else a hand or the table.
     """
     equally = [n for n, depth in enumerate(penetration) if n != index and abs(depth - penetration[index]) < 1e-6]
     if equally:
@@ -100,11 +95,7 @@ def _find_crept(
 
 
 def measure_slip(tool_pose: np.ndarray, object_pose: np.ndarray) -> float:
-    """Longest way [m] that the point of an object that was between the fingers at first has moved in the hand.
-
-    Args:
-        tool_pose, object_pose: [t 7] xyz [m] and quaternion xyzw, world.
-    """
+    """Largest displacement [m] in the hand of the initially held point, for poses [t 7] xyz [m], quaternion xyzw, world."""
     hand, thing = Rotation.from_quat(tool_pose[:, 3:]), Rotation.from_quat(object_pose[:, 3:])
     grasped = thing[0].inv().apply(tool_pose[0, :3] - object_pose[0, :3])
     at = object_pose[:, :3] + thing.apply(grasped)

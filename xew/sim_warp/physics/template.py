@@ -1,12 +1,8 @@
-"""The common template: one Newton world that any robot, task and seed fits, so that all of them form one batch.
+"""The common template: one Newton world for any robot, task and seed, which all form one batch.
 
-Reads  RobotSpec (through its URDF) and Scene
-Writes a world of a newton.ModelBuilder: two arms of seven revolute joints and two finger slides each, `FREE_SLOTS` free
-       bodies, one hinged lid, and whatever is fixed to the table
-
-MuJoCo Warp wants the same bodies and joints in every world; what their frames, axes, limits, masses and convex hulls are
-may differ. So arms of six joints get a seventh that is pinned, and slots that a scene does not need float, massless in
-gravity and without a shape, below the table.
+A world has two arms of seven revolute joints and two finger slides each, `FREE_SLOTS` free bodies, one hinged lid, and fixed
+objects. MuJoCo Warp needs the same bodies and joints in every world; their frames, axes, limits, masses and convex hulls may
+differ. Arms of six joints get a pinned seventh. Unused slots float below the table without gravity or shape.
 """
 
 from collections.abc import Sequence
@@ -30,48 +26,46 @@ from xew.sim_warp.stage import TABLE_SIZE, TABLE_TOP
 
 ARM_JOINTS = 7
 FREE_SLOTS = 3
-"""Number of bodies that move freely."""
+"""Number of free bodies."""
 PARKED = tuple((0.3 * slot, 0.0, 0.3, 0.0, 0.0, 0.0, 1.0) for slot in range(FREE_SLOTS))
-"""Poses (xyz [m] and quaternion xyzw) of free bodies that a scene has no object for: under the table, out of sight."""
+"""Poses (xyz [m] and quaternion xyzw) of unused free bodies, below the table."""
 SIDES = ("left", "right")
 
 ARM_STIFFNESS, ARM_DAMPING, ARM_ARMATURE = 4000.0, 120.0, 1.0
-"""Position gain [N m/rad], velocity gain [N m s/rad] and reflected rotor inertia [kg m2] of every arm joint: with the
-commanded velocity fed forward a joint follows its command within a few milliradians, whatever arm hangs on it.
-MuJoCo solves contacts as if the velocity gain acted explicitly and then integrates it implicitly: where time step times
-gain is not small beside the inertia, what a hand holds is thrown ahead of it (9 mm in a lift with 400 and 0.3)."""
+"""Position gain [N m/rad], velocity gain [N m s/rad] and reflected rotor inertia [kg m2] of every arm joint. With the commanded
+velocity fed forward, joints follow commands within a few milliradians. The time step times the velocity gain must be small
+compared with the inertia: MuJoCo's contact solver treats the gain explicitly, and held objects would jump ahead of the hand."""
 CONTACT_TIME = 0.012
-"""Time constant in which soft contacts push back [s], three time steps: held things sink 1 mm into a pad."""
+"""Time constant of soft contacts [s], three time steps: held objects sink 1 mm into a pad."""
 PIN_STIFFNESS, PIN_DAMPING, PIN_ARMATURE = 20000.0, 500.0, 1.0
 """Gains and inertia of the pinned seventh joint of an arm that has six."""
 FINGER_STIFFNESS, FINGER_DAMPING, FINGER_ARMATURE = 10000.0, 200.0, 0.5
-"""Gains [N/m, N s/m] and inertia [kg] of a finger: stiff enough that a wall of 5 mm is held with the full force."""
+"""Gains [N/m, N s/m] and inertia [kg] of a finger; a wall of 5 mm is held with the full force."""
 FINGER_FORCE = 16.0
-"""Largest force of a finger [N], gentle beside the Panda hand's 70 N: our objects are light."""
+"""Largest force of a finger [N]; the objects are light."""
 PAD_FRICTION = 1.2
 """Sliding friction of rubber pads on plastic or wood."""
 LINK_FRICTION = 0.5
 """Sliding friction of all other links and of the table."""
 HINGE_ARMATURE = 0.02
-"""Inertia added to a hinge [kg m2]: it gives a light lid a share in the solver's cost beside the arms, without which its
-friction is not solved for."""
+"""Inertia added to a hinge [kg m2]; without it the solver neglects the friction of a light lid."""
 HINGE_SOLIMP = (0.99, 0.99, 0.001, 0.5, 2.0)
 """Impedance of a hinge's dry friction: with MuJoCo's default a light lid creeps shut at 4 degrees a second."""
 FARTHEST_MASS = 0.3
-"""Radius of gyration [m] beyond which a link's inertia is taken for a placeholder (RoboTwin's UR5 gripper states
-1 kg m2 for fingers of 100 g) and that of its collision shapes is used. The same where an inertia is not positive."""
+"""Radius of gyration [m] beyond which a link's inertia is a placeholder (RoboTwin's UR5 gripper has 1 kg m2 for fingers of
+100 g). The inertia of its collision shapes replaces it, as for inertias that are not positive."""
 
 ROBOT_GROUP = {"left": -1, "right": -2}
 OBJECT_GROUP = 1
-"""Newton's collision groups: a negative group meets every other group but itself."""
+"""Newton's collision groups; a negative group collides with every group but itself."""
 
 
 @dataclass(frozen=True)
 class RigidGroup:
-    """Links that move as one: what a moving joint carries up to the next one."""
+    """Links between two moving joints, which move as one body."""
 
     parent_to_joint: np.ndarray
-    """[4 4] joint frame in the frame of the group before it."""
+    """[4 4] joint frame in the frame of the parent group."""
     joint: Joint
     mass: float
     center: np.ndarray
@@ -84,14 +78,14 @@ class RigidGroup:
 
 @lru_cache(maxsize=512)
 def arm_groups(path: Path, arm: Arm) -> tuple[list[RigidGroup], list[RigidGroup]]:
-    """The rigid groups of an arm's revolute joints, base outwards, and those of its two fingers."""
+    """The rigid groups of an arm's revolute joints, base outwards, and of its two fingers."""
     urdf, moving = load_urdf(path), [*arm.joints, *arm.fingers]
     groups = {name: _rigid_group(urdf, urdf.joints[name], moving) for name in moving}
     return [groups[name] for name in arm.joints], [groups[name] for name in arm.fingers]
 
 
 def _rigid_group(urdf: Urdf, joint: Joint, moving: list[str]) -> RigidGroup:
-    """Mass and shapes of a joint's child and of all that is fixed to it, in the child's frame."""
+    """Mass and shapes of a joint's child and its fixed links, in the child's frame."""
     parts = [(joint.child, np.eye(4))]
     for link, pose in parts:  # grows while it is walked
         parts += [(j.child, pose @ j.origin) for j in urdf.joints.values() if j.parent == link and j.name not in moving]
@@ -104,7 +98,7 @@ def _rigid_group(urdf: Urdf, joint: Joint, moving: list[str]) -> RigidGroup:
 
 
 def _from_last_moving(urdf: Urdf, joint: Joint, moving: list[str]) -> np.ndarray:
-    """[4 4] the joint's frame seen from the child of the moving joint before it, or from the root."""
+    """[4 4] the joint's frame in the child of the previous moving joint, or in the root."""
     pose = np.eye(4)
     for above in urdf.chain(joint.child):
         pose = pose @ above.origin
@@ -121,18 +115,27 @@ def _mass_properties(
     mass = sum((inertial.mass for inertial, _ in known), 0.0)
     if mass <= 0:
         return 0.05, np.zeros(3), np.eye(3) * 5e-5
-    centers = [pose[:3, :3] @ inertial.center + pose[:3, 3] for inertial, pose in known]
-    center = sum(inertial.mass * c for (inertial, _), c in zip(known, centers, strict=True)) / mass
-    inertia = np.zeros((3, 3))
-    for (inertial, pose), c in zip(known, centers, strict=True):
-        arm = c - center
-        inertia += pose[:3, :3] @ inertial.inertia @ pose[:3, :3].T + inertial.mass * (
-            arm @ arm * np.eye(3) - np.outer(arm, arm)
-        )
+    center, inertia = _combine(
+        [inertial.mass for inertial, _ in known],
+        [pose[:3, :3] @ inertial.center + pose[:3, 3] for inertial, pose in known],
+        [pose[:3, :3] @ inertial.inertia @ pose[:3, :3].T for inertial, pose in known],
+    )
     is_placeholder = np.sqrt(np.trace(inertia) / mass) > FARTHEST_MASS or np.linalg.eigvalsh(inertia).min() <= 0
     if is_placeholder and hulls:
         return solid(mass, [points for _, points in hulls])
     return mass, center, inertia
+
+
+def _combine(
+    masses: Sequence[float], centers: Sequence[np.ndarray], inertias: Sequence[np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Center [3] and inertia about it [3 3] of bodies together, from their own centers and inertias (parallel axes)."""
+    center = np.asarray(sum(mass * middle for mass, middle in zip(masses, centers, strict=True)) / sum(masses))
+    inertia = np.zeros((3, 3))
+    for mass, middle, own in zip(masses, centers, inertias, strict=True):
+        arm = middle - center
+        inertia += own + mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+    return center, inertia
 
 
 def solid(mass: float, hulls: Sequence[np.ndarray]) -> tuple[float, np.ndarray, np.ndarray]:
@@ -144,13 +147,9 @@ def solid(mass: float, hulls: Sequence[np.ndarray]) -> tuple[float, np.ndarray, 
 def _solid(mass: float, hulls: tuple[bytes, ...]) -> tuple[float, np.ndarray, np.ndarray]:
     """`solid` of float32 points: all robots of a seed meet the same objects."""
     pieces = [_convex(points) for points in hulls]
-    volume = sum(piece.volume for piece in pieces)
-    center = sum(piece.volume * piece.center_mass for piece in pieces) / volume
-    inertia = np.zeros((3, 3))
-    for piece in pieces:
-        arm = piece.center_mass - center
-        inertia += piece.moment_inertia + piece.volume * (arm @ arm * np.eye(3) - np.outer(arm, arm))
-    return mass, center, inertia * mass / volume
+    volumes = [piece.volume for piece in pieces]
+    center, inertia = _combine(volumes, [p.center_mass for p in pieces], [p.moment_inertia for p in pieces])
+    return mass, center, inertia * mass / sum(volumes)
 
 
 def new_builder() -> "newton.ModelBuilder":
@@ -161,7 +160,7 @@ def new_builder() -> "newton.ModelBuilder":
 
 
 def add_world(builder: "newton.ModelBuilder", robot: RobotSpec, scene: Scene) -> None:
-    """Append one world of the template: `robot` before `scene`. Raises ConfigError if the scene has more than it holds."""
+    """Append one world of the template. Raises ConfigError if the scene has too many objects."""
     builder.begin_world(label=f"{scene.task}/{scene.seed}/{robot.key}")
     for side, arm in zip(SIDES, robot.arms, strict=True):
         _add_arm(builder, side, arm, robot.urdf)
@@ -191,7 +190,7 @@ def _add_arm(builder: "newton.ModelBuilder", side: str, arm: Arm, path: Path) ->
 
 
 def _add_body(builder: "newton.ModelBuilder", side: str, name: str, group: RigidGroup | None) -> int:
-    """Add a body with a group's mass and shapes or, without a group, a speck that only carries the pinned joint."""
+    """Add a body with a group's mass and shapes or, without a group, a small body for the pinned joint."""
     mass, center, inertia = (group.mass, group.center, group.inertia) if group else (0.1, np.zeros(3), np.eye(3) * 1e-4)
     body = builder.add_link(
         mass=mass,
@@ -201,7 +200,7 @@ def _add_body(builder: "newton.ModelBuilder", side: str, name: str, group: Rigid
         label=f"{side}_{name}",
         custom_attributes={"mujoco:gravcomp": 1.0},
     )
-    has_pad = group is not None and "pad" in dict(group.hulls)  # a finger of a user's URDF may name none: then all of it grips
+    has_pad = group is not None and "pad" in dict(group.hulls)  # without a pad, the whole finger of a user's URDF grips
     for label, points in group.hulls if group else ():
         friction = PAD_FRICTION if label == "pad" or (name.startswith("finger") and not has_pad) else LINK_FRICTION
         _add_hull(builder, body, points, friction, ROBOT_GROUP[side], f"{side}_{name}")
@@ -245,7 +244,7 @@ def _add_pin(builder: "newton.ModelBuilder", label: str, parent: int, child: int
 def _add_finger_joint(
     builder: "newton.ModelBuilder", label: str, parent: int, child: int, group: RigidGroup, closed: float, opened: float
 ) -> int:
-    """Add a slide whose position is the finger's way from closed, so that both fingers of all robots count alike."""
+    """Add a slide whose position is the finger's distance from closed, for all robots."""
     frame = group.parent_to_joint.copy()
     frame[:3, 3] += frame[:3, :3] @ group.joint.axis * closed
     return builder.add_joint_prismatic(
@@ -317,7 +316,7 @@ def _add_free_slot(builder: "newton.ModelBuilder", slot: int, thing: SceneObject
 
 
 def _add_hinge_slot(builder: "newton.ModelBuilder", thing: SceneObject | None, scene: Scene) -> None:
-    """Add a lid on a hinge in the world or, where no object has one, a pinned speck below the table."""
+    """Add a lid on a hinge in the world, or a pinned small body below the table."""
     if thing is None or thing.hinge is None:
         parts = (0.1, np.zeros(3), np.eye(3) * 1e-4)
         frame, axis = wp.transform((0, 0.3, 0.3), wp.quat_identity()), (0.0, 0.0, 1.0)
@@ -374,7 +373,7 @@ def _add_hull(builder: "newton.ModelBuilder", body: int, points: np.ndarray, fri
 
 @lru_cache(maxsize=4096)
 def _hull(points: bytes) -> "newton.Mesh":
-    """The convex hull of float32 points [k 3]; a batch holds the same links hundreds of times."""
+    """The convex hull of float32 points [k 3], cached for the links of a batch."""
     hull = _convex(points)
     return newton.Mesh(hull.vertices.astype(np.float32), hull.faces.flatten().astype(np.int32), compute_inertia=False)
 

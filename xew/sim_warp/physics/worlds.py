@@ -1,8 +1,4 @@
-"""Worlds to simulate, the motion that comes of them, and the template's coordinates: what both physics engines share.
-
-Reads  RobotSpec, Scene and canonical commands
-Writes the Newton model of the common template (template.py), actuator targets, and `Motion`s in canonical layout
-"""
+"""Worlds to simulate, their motions, and the template's coordinates, shared by both physics engines."""
 
 import warnings
 from dataclasses import dataclass
@@ -32,8 +28,8 @@ JOINTS_PER_SIDE = ARM_JOINTS + 2
 ROBOT_DOFS = 2 * JOINTS_PER_SIDE
 FREE_START = ROBOT_DOFS
 HINGE_INDEX = FREE_START + 7 * FREE_SLOTS
-"""First places in the template's joint coordinates of the free bodies (xyz and quaternion wxyz) and of the lid; the arms with
-their fingers come first."""
+"""First indices of the free bodies (xyz and quaternion wxyz) and of the lid in the template's joint coordinates, after the arms
+with their fingers."""
 
 
 @dataclass(frozen=True)
@@ -43,12 +39,12 @@ class World:
     robot: RobotSpec
     scene: Scene
     action: np.ndarray
-    """[t 16] canonical commands at every stored frame [rad; grippers 0 closed, 1 open]; the robot begins at the first."""
+    """[t 16] canonical commands at every stored frame [rad; grippers 0 closed, 1 open]; the robot starts at the first."""
 
 
 @dataclass(frozen=True)
 class Motion:
-    """What physics made of a world, at every stored frame."""
+    """Simulated motion of a world at every stored frame."""
 
     joint_pos: np.ndarray
     """[t 16] float32 measured positions, canonical layout [rad; grippers 0 closed, 1 open]."""
@@ -61,17 +57,17 @@ class Motion:
     contact: np.ndarray
     """[t 2 o] bool, whether fingers of the left, right arm touch each object."""
     penetration: np.ndarray
-    """[t o] float32 depth to which each object and anything else are in each other [m]."""
+    """[t o] float32 penetration of each object [m]."""
     table_overlap: float
-    """Depth to which an arm pressed into the table at any stored frame [m]."""
+    """Largest penetration of an arm and the table [m]."""
     arm_overlap: float
-    """Depth to which the arms pressed into each other at any stored frame [m]."""
+    """Largest penetration of the arms [m]."""
     overflow: bool
-    """Whether a contact or constraint buffer was too small, or a number not finite: then the motion must not be used."""
+    """Whether a contact or constraint buffer was too small, or a number not finite; the motion is then invalid."""
 
 
 def finger_strokes(robot: RobotSpec, side: int) -> np.ndarray:
-    """[2] float64 distance that each finger of an arm slides from gripper 0 to 1 [m]."""
+    """[2] float64 travel of each finger of an arm from gripper 0 to 1 [m]."""
     return np.abs(np.subtract(robot.arms[side].finger_open, robot.arms[side].finger_closed))
 
 
@@ -115,7 +111,7 @@ def build_solver(worlds: list[World], device: str, **options: object) -> "newton
     for world in worlds:
         add_world(builder, world.robot, world.scene)
     with warnings.catch_warnings():
-        # The published inertia of the Panda's link 4 breaks the triangle inequality a little; Newton mends and tells it.
+        # The published inertia of the Panda's link 4 slightly violates the triangle inequality; Newton corrects it.
         warnings.filterwarnings("ignore", message="Inertia validation corrected")
         model = builder.finalize(device=device)
     solver = newton.solvers.SolverMuJoCo(model, **SOLVER_OPTIONS, **options)
@@ -124,7 +120,7 @@ def build_solver(worlds: list[World], device: str, **options: object) -> "newton
 
 
 def initial_joints(world: World) -> np.ndarray:
-    """[40] float64 the template's joint coordinates when a world begins [rad, m]."""
+    """[40] float64 initial joint coordinates of the template [rad, m]."""
     qpos = np.zeros(HINGE_INDEX + 1)
     qpos[:ROBOT_DOFS] = template_joints(world.robot, world.action[:1])[0]
     poses = [thing.pose for thing in world.scene.objects if not thing.is_fixed]
@@ -143,7 +139,7 @@ LEFT_FINGERS, RIGHT_FINGERS, FIRST_OBJECT, TABLE, LEFT_ARM_LINKS, RIGHT_ARM_LINK
 
 
 def shape_owners(labels: list[str]) -> np.ndarray:
-    """[g] int32 owners of collision shapes, by the labels that the template gives them."""
+    """[g] int32 owners of collision shapes, by their labels in the template."""
     return np.array([_owner(label.rsplit("/", 1)[-1]) for label in labels], np.int32)
 
 

@@ -1,9 +1,8 @@
-"""Seeds to episodes, in the order in which a seed goes through the files.
+"""Seeds to episodes.
 
-`seeds` says which are tried. `produce` makes scenes in workers: `cells` plans (by `kinematics.expert`) and simulates them,
-`outcome` says why one does not count, `episodes` renders and writes them. `rerender` makes what is on disk again, `surfaces`
-follows points on it, which `kept_tracks` keeps, and `summary` lists it. `warm_up` compiles the kernels of all that where there
-are none. Workers are forked with what `preloaded` imports. What is written is complete or absent.
+`seeds` schedules seeds. `produce` makes scenes in workers: `cells` plans and simulates, `outcome` finds failures, `episodes`
+renders and writes. For episodes on disk, `rerender` renders them again, `surfaces` tracks surface points, which `kept_tracks`
+stores, and `summary` makes a table. `warm_up` compiles kernels. Workers are forked with the imports of `preloaded`.
 """
 
 __all__ = [

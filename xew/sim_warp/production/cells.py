@@ -1,8 +1,4 @@
-"""Cells, one (task, seed, robot) each, from their jobs to what physics made of them.
-
-Reads  `Job`s: (task, seed) and robots
-Writes `Cell`s: first with scene, plan and joint commands (`plan_cells`), then with their motion (`simulate_cells`)
-"""
+"""Cells, one (task, seed, robot) each: planned by `plan_cells`, then simulated by `simulate_cells`."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -24,66 +20,60 @@ from xew.sim_warp.tasks import Task, get_task
 
 @dataclass(frozen=True)
 class Job:
-    """One scene, and the robots that do not have it yet."""
+    """One scene and its missing robots."""
 
     task: str
     """Key of the registry or module:NAME."""
     seed: int
     robots: tuple[str, ...]
-    """Names under which episodes know them."""
+    """Their names in episodes."""
     rejected: bool = False
-    """Whether another robot has failed on it already; then nothing is rendered."""
+    """Whether another robot has failed; then nothing is rendered."""
     motion: str = SHARED_MOTION
     """Kind of motion, one of `xew.protocol.MOTIONS`."""
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One (task, seed, robot): planned, and simulated where the robot can follow the plan."""
+    """One (task, seed, robot): planned, and simulated if the robot can follow the plan."""
 
     task_name: str
-    """Key of the registry or module:NAME, as asked for."""
+    """Key of the registry or module:NAME."""
     scene: Scene
     path: ToolPath
-    """Path of both tools: all robots' of the scene, or the robot's own."""
+    """Path of both tools, shared by all robots or the robot's own."""
     robot_name: str
     robot: RobotSpec
     commands: Commands
     motion: Motion | None = None
-    """Motion that physics made of the commands; None before, and where the robot cannot follow the plan."""
+    """Simulated motion; None before the simulation, or if the robot cannot follow the plan."""
     motion_kind: str = SHARED_MOTION
-    """Kind of motion that the commands are of, one of `xew.protocol.MOTIONS`."""
+    """Kind of motion, one of `xew.protocol.MOTIONS`."""
     tool_pose: np.ndarray | None = None
     """[t 2 7] float32 measured tool poses, xyz [m] and quaternion xyzw, world; None without motion."""
     failure: tuple[str, str] | None = None
-    """Reason for which the cell does not count, one of `episode.FAILURES`, and a sentence; None if it succeeded."""
+    """One of `episode.FAILURES` and a sentence; None for success."""
 
     @property
     def task(self) -> Task:
-        """The task itself. It stays out of what travels to another process, since its functions may be lambdas."""
+        """The task. It is not a field: its functions may be lambdas, which cannot be pickled."""
         return get_task(self.task_name)
 
     @property
     def known_motion(self) -> Motion:
-        """The motion of a cell that is known to have one."""
+        """The motion of a simulated cell."""
         assert self.motion is not None, f"{self.robot.key} cannot follow the plan of {self.scene.task}/{self.scene.seed}"
         return self.motion
 
     @property
     def recording(self) -> Recording:
-        """What the camera looks at."""
+        """The recording for the renderer."""
         motion = self.known_motion
         return scene_recording(self.robot, self.scene, motion.joint_pos, motion.object_pose, motion.object_joint)
 
 
 def plan_cells(jobs: Sequence[Job], robots: Mapping[str, RobotSpec] = ROBOTS, device: str | None = None) -> list[list[Cell]]:
-    """Scene, plan and commands of every cell, by job; the commands of all cells of a robot are solved together.
-
-    Args:
-        jobs: the seeds, and the names of the robots that do each.
-        robots: all of these robots by name.
-        device: Warp's name of the device that solves; its default if left out.
-    """
+    """Scene, plan and commands of every cell, by job; the commands of all cells of a robot are solved together on a device."""
     tasks = [get_task(job.task) for job in jobs]
     scenes = [task.sample(scene_rng(job.task, job.seed), job.seed) for job, task in zip(jobs, tasks, strict=True)]
     plans = [task.plan(scene) for task, scene in zip(tasks, scenes, strict=True)]
@@ -102,14 +92,7 @@ def plan_cells(jobs: Sequence[Job], robots: Mapping[str, RobotSpec] = ROBOTS, de
 def plan_motion(
     robot: RobotSpec, plans: Sequence[Timeline], kind: str, device: str | None = None
 ) -> list[tuple[ToolPath, Commands]]:
-    """A robot's tool paths and commands for many plans, in one kind of motion (`xew.protocol.MOTIONS`).
-
-    Args:
-        robot: whose commands.
-        plans: of the scenes.
-        kind: of motion.
-        device: Warp's name of the device that solves; its default if left out.
-    """
+    """A robot's tool paths and commands for many plans, in one kind of motion (`xew.protocol.MOTIONS`)."""
     if kind == OWN_MOTION:
         return own_commands(robot, plans, device)
     paths = [plan.path() for plan in plans]
@@ -117,11 +100,7 @@ def plan_motion(
 
 
 def simulate_cells(seeds: list[list[Cell]], device: str | None = None, batch: int | None = None) -> list[list[Cell]]:
-    """The same cells with their motion, where the robot can follow the plan.
-
-    Args:
-        device, batch: as for `physics.simulate`.
-    """
+    """The same cells with their motion, if the robot can follow the plan; arguments as of `physics.simulate`."""
     cells = [cell for cells in seeds for cell in cells if cell.commands.problem is None]
     worlds = [World(cell.robot, cell.scene, cell.commands.action) for cell in cells]
     simulated = {
@@ -131,7 +110,7 @@ def simulate_cells(seeds: list[list[Cell]], device: str | None = None, batch: in
 
 
 def with_motion(cell: Cell, motion: Motion) -> Cell:
-    """A planned cell with the motion that physics made of its commands, and why that does not count, if it does not."""
+    """A planned cell with its simulated motion and its failure, if any."""
     tools = measured_tools(cell.robot, motion.joint_pos)
     failure = find_failure(cell.task, cell.scene, cell.path, cell.commands.action, motion, tools)
     return replace(cell, motion=motion, tool_pose=tools, failure=failure)

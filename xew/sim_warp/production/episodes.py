@@ -1,8 +1,4 @@
-"""Simulated cells to episodes on disk: pictures, states, header.
-
-Reads  `Cell`s with their motion
-Writes episodes as `xew/episode.py` defines them; of a cell whose seed is rejected only the header
-"""
+"""Simulated cells to episodes on disk; for a rejected seed only the headers."""
 
 from collections.abc import Sequence
 from functools import cache
@@ -24,11 +20,11 @@ from xew.sim_warp.scene import Scene, scene_hash
 from xew.sim_warp.tasks import Task
 
 Pixels = tuple[Observation, np.ndarray]
-"""Images of a cell: what the camera sees, and the robot alone [t h w 3] uint8."""
+"""Images of a cell: the camera's observation, and the robot alone [t h w 3] uint8."""
 
 
 def render_cells(cells: Sequence[Cell], renderer: Renderer) -> list[Pixels]:
-    """What the camera sees of each cell, and the robot alone by its commands [t h w 3] uint8."""
+    """The camera's observation of each cell, and the robot alone by its commands [t h w 3] uint8."""
     views = observe(renderer, [cell.recording for cell in cells])
     renders = command_renders([(cell.robot, cell.commands.action) for cell in cells], renderer=renderer)
     return list(zip(views, renders, strict=True))
@@ -44,7 +40,7 @@ def write_cell(cell: Cell, pixels: Pixels | None, out: Path, device: wp.Device, 
 
 
 def header(cell: Cell, device: wp.Device) -> Record:
-    """What is known of a cell but its hashes: who, how long, success or the reason of failure."""
+    """The header of a cell without hashes."""
     reason, detail = cell.failure or (None, "")
     return Record(
         task=cell.task_name,
@@ -65,13 +61,13 @@ def header(cell: Cell, device: wp.Device) -> Record:
 
 
 def fill_instruction(task: Task, scene: Scene) -> str:
-    """The instruction of a task with the words of this scene. Raises ConfigError where the scene has no word for a slot."""
+    """The instruction of a task with a scene's words. Raises ConfigError if the scene has no word for a slot."""
     try:
         return task.instruction.format(**scene.words)
     except (KeyError, IndexError, ValueError) as error:
         raise ConfigError(
             f"the instruction of {scene.task}, {task.instruction!r}, cannot be filled ({error}) from the words of its scene "
-            f"({', '.join(scene.words) or 'none'}); add to Scene.words what it has in braces."
+            f"({', '.join(scene.words) or 'none'}); add the words in braces to Scene.words."
         ) from error
 
 

@@ -1,7 +1,6 @@
-"""Points on surfaces, kept on disk, so that an episode's are rendered once and not in every run that compares them.
+"""Store of surface tracks, <folder>/<task>/<seed>/<robot>.npz: an episode's tracks are rendered once.
 
-Reads  <folder>/<task>/<seed>/<robot>.npz
-Writes the same; a file says what it was made from, and one that was made from anything else, or is damaged, is not taken
+A file holds a key of its inputs. Damaged files and files with another key are ignored.
 """
 
 import hashlib
@@ -23,27 +22,27 @@ from xew.sim_warp.embodiment.urdf import load_urdf
 from xew.sim_warp.rendering.surfaces import SurfaceTracks
 
 _SAVING = threading.Lock()
-"""Lock of the file of a process that is being written: threads may grade the same episode over different frames."""
+"""Lock for writing: threads may grade the same episode over different frames."""
 CODE = ("embodiment", "geometry", "kinematics", "production", "rendering")
-"""Packages of the room whose code, with the stage, decides where points are and what is seen of them."""
+"""Packages whose code, with the stage, determines the tracks."""
 
 
 def tracks_path(folder: Path, record: Record) -> Path:
-    """The file of an episode's tracks below the folder that keeps them."""
-    place = episode_folder(folder, record.task, record.seed, record.robot)
-    return place.with_name(f"{place.name}.npz")
+    """The file of an episode's tracks in a store."""
+    path = episode_folder(folder, record.task, record.seed, record.robot)
+    return path.with_name(f"{path.name}.npz")
 
 
 def tracks_key(robot: RobotSpec, scene_hash: str, states: States) -> str:
-    """SHA-256 over all that an episode's tracks depend on: the robot, the scene, recorded motion, the camera, and the code."""
-    made_from = (scene_hash, repr(replace(robot, urdf=Path())), _digest_urdf(robot.urdf), _digest_code())
+    """SHA-256 over all inputs of an episode's tracks: the robot, the scene, recorded motion, the camera, and the code."""
+    inputs = (scene_hash, repr(replace(robot, urdf=Path())), _digest_urdf(robot.urdf), _digest_code())
     image = repr(states.robot_mask.shape)
     arrays = (states.joint_pos, states.object_pose, states.object_joint, states.intrinsics, states.extrinsics)
-    return hashlib.sha256("\n".join((*made_from, image, *map(array_hash, arrays))).encode()).hexdigest()
+    return hashlib.sha256("\n".join((*inputs, image, *map(array_hash, arrays))).encode()).hexdigest()
 
 
 def load_tracks(path: Path, key: str) -> SurfaceTracks | None:
-    """The tracks that were kept under a key; None where there are none, or others."""
+    """The stored tracks with a key, or None."""
     try:
         stored = read_npz(path)
         if str(stored["key"]) != key:
@@ -56,7 +55,7 @@ def load_tracks(path: Path, key: str) -> SurfaceTracks | None:
 
 
 def save_tracks(path: Path, key: str, tracks: SurfaceTracks) -> None:
-    """Keep tracks under a key; where the disk does not take them, they are made again next time."""
+    """Store tracks under a key; errors of the disk are ignored."""
     arrays = {field.name: getattr(tracks, field.name) for field in fields(tracks)}
     arrays["names"] = np.array(tracks.names)
     try:
@@ -73,6 +72,6 @@ def _digest_urdf(path: Path) -> str:
 
 @lru_cache(maxsize=1)
 def _digest_code() -> str:
-    room = Path(__file__).parents[1]
-    files = [file for folder in CODE for file in sorted((room / folder).rglob("*.py"))] + [room / "stage.py"]
+    package = Path(__file__).parents[1]
+    files = [file for folder in CODE for file in sorted((package / folder).rglob("*.py"))] + [package / "stage.py"]
     return f"{digest_files(files)} {np.__version__} {wp.__version__}"

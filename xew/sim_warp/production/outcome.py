@@ -1,8 +1,4 @@
-"""The outcome of a motion: success, or why it does not count, in one of the words of `episode.FAILURES` and a sentence.
-
-Reads  a task with its scene and plan, the commands, and the motion that physics made of them
-Writes the first reason for which the motion fails, or nothing
-"""
+"""The outcome of a motion: success, or one of `episode.FAILURES` with a sentence."""
 
 import numpy as np
 
@@ -14,22 +10,20 @@ from xew.sim_warp.scene import Scene
 from xew.sim_warp.tasks import Moment, Task
 
 DEEPEST_IN_TABLE = 0.0015
-"""Depth to which an arm may press into the table [m]: a finger that brushes it passes."""
+"""Largest penetration of an arm and the table [m]; a finger may brush the table."""
 DEEPEST_IN_ARM = 0.0002
-"""Depth to which the arms may press into each other [m]: next to nothing, for a hand driven into the other is 0.4 mm deep."""
+"""Largest penetration of the arms [m]; colliding hands reach 0.4 mm."""
 LAST_FRAMES = 3
-"""Number of frames at the end of a hold in which a hand that has not lost its object touches it at least once."""
+"""Number of last frames of a hold, in one of which the hand must touch its object."""
 
 
 def find_failure(
     task: Task, scene: Scene, path: ToolPath, action: np.ndarray, motion: Motion, tools: np.ndarray
 ) -> tuple[str, str] | None:
-    """Why a motion does not count: one of `episode.FAILURES` and a sentence; None if it succeeded.
+    """The first failure of a motion: one of `episode.FAILURES` and a sentence; None for success.
 
     Args:
-        task, scene, path: what was to be done, where, and the plan for it.
         action: [t 16] canonical commands [rad; grippers 0 to 1].
-        motion: what physics made of the commands.
         tools: [t 2 7] measured tool poses, xyz [m] and quaternion xyzw, world.
     """
     if motion.overflow:
@@ -50,13 +44,13 @@ def find_failure(
 
 
 def moment(action: np.ndarray, motion: Motion, tools: np.ndarray, frame: int) -> Moment:
-    """One frame as a success test sees it, of commands [t 16] and measured tool poses [t 2 7], world."""
+    """One frame for a success test, from commands [t 16] and measured tool poses [t 2 7], world."""
     gripper = action[frame, [column for _, column in ARMS]]
     return Moment(motion.object_pose[frame], motion.object_joint[frame], tools[frame], gripper, motion.contact[frame])
 
 
 def _find_lost_hold(scene: Scene, path: ToolPath, motion: Motion) -> tuple[str, str]:
-    """Which hold did not come about or did not last."""
+    """The first hold that was not reached or was lost."""
     for hold in path.holds:
         frames = slice(int(hold.start * path.frame_rate), int(hold.end * path.frame_rate) + 1)
         touched = motion.contact[frames, hold.arm, scene.index(hold.name)]

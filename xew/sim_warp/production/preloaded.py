@@ -1,8 +1,4 @@
-"""What worker processes are forked with, so that none of them imports for seconds: physics, the renderer, and Newton itself.
-
-Reads  nothing
-Writes nothing; importing it is all
-"""
+"""Slow imports that worker processes are forked with: physics, the renderer and Newton."""
 
 from xew.sim_warp.devices.newton import load_newton
 from xew.sim_warp.production import produce

@@ -1,13 +1,10 @@
 """Scenes made in worker processes: simulated in shares, then rendered and written one scene at a time.
 
-Reads  `Job`s: (task, seed) and the robots that still lack it
-Writes episodes and, for what did not succeed, their headers with the reason
-
-A scene counts only when all of its robots succeed, and only then it is rendered. So all of its robots are simulated first; when
-the last of them is done the scene is written, ahead of all that has not begun. Physics on a CPU takes a core for each robot, so
-a share is one robot of one scene there. A GPU steps many worlds together, so a share is a batch of whole scenes there.
+A scene is rendered only if all of its robots succeed: all of them are simulated first. A completed scene is written before
+further simulations begin. On a CPU a share is one robot of one scene, on a GPU a batch of whole scenes.
 """
 
+import operator
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -29,26 +26,26 @@ from xew.sim_warp.robots import ROBOTS, RobotSpec
 
 @dataclass(frozen=True)
 class Production:
-    """How and where scenes are made; what every worker needs."""
+    """Settings of the production, sent to every worker."""
 
     out: Path
     """Folder of the data set."""
     robots: Mapping[str, RobotSpec] = field(default_factory=lambda: ROBOTS)
     """All robots of the jobs by name."""
     gpu_physics: bool = False
-    """Whether each worker's own GPU plans and steps physics, and not the CPU."""
+    """Whether each worker's GPU runs planning and physics instead of the CPU."""
     batch: int = 256
     """Number of worlds that a GPU steps together."""
     videos: bool = True
-    """Store videos; without, an episode has all states and hashes, and `rerender.add_videos` makes its videos."""
+    """Whether to store videos; otherwise `rerender.add_videos` makes them from the states."""
 
     @property
     def physics(self) -> str | None:
-        """Warp's name of the device that plans and steps physics; None for a worker's own."""
+        """Warp's name of the device for planning and physics; None for a worker's own."""
         return None if self.gpu_physics else "cpu"
 
     def shares(self, jobs: Sequence[Job]) -> list[list[Job]]:
-        """The jobs cut into what one worker simulates at a time."""
+        """The jobs in the shares that one worker simulates at a time."""
         if not self.gpu_physics:
             return [[replace(job, robots=(robot,))] for job in jobs for robot in job.robots]
         shares: list[list[Job]] = []
@@ -64,15 +61,11 @@ class Production:
 
 @dataclass
 class _Scene:
-    """A job, and how far it is."""
+    """A job and its simulated cells."""
 
     job: Job
     cells: list[Cell] = field(default_factory=list)
     seconds: float = 0.0
-
-    @property
-    def is_simulated(self) -> bool:
-        return len(self.cells) == len(self.job.robots)
 
     @property
     def ordered_cells(self) -> list[Cell]:
@@ -82,46 +75,36 @@ class _Scene:
 
 
 Outcome = tuple[list[list[Cell]] | list[Record], float]
-"""Simulated cells of each job of a share, or the headers of a written scene; and the seconds spent on it."""
+"""Simulated cells of each job of a share, or the headers of a written scene; and the time for it [s]."""
 
 
 def make_scenes(workers: Workers, jobs: Sequence[Job], production: Production) -> Iterator[tuple[list[Record], float]]:
-    """Make some scenes; the headers of each job in the order of its robots, and the seconds that workers spent on it.
-
-    Args:
-        workers: processes to which shares and simulated cells travel by pickle.
-        jobs: no two of them of the same task and seed.
-        production: how they are made.
-    """
+    """Make scenes of different tasks or seeds; yields the headers of a job in the order of its robots, and its time [s]."""
     scenes = {(job.task, job.seed): _Scene(job) for job in jobs}
     work: deque[Callable[[], Outcome]] = deque(partial(_simulate, share, production) for share in production.shares(jobs))
-    for made, seconds in workers.run(_call, work):
-        if made and isinstance(made[0], Record):
-            records = [record for record in made if isinstance(record, Record)]
+    for results, seconds in workers.run(operator.call, work):
+        if results and isinstance(results[0], Record):
+            records = [record for record in results if isinstance(record, Record)]
             yield records, scenes[records[0].task, records[0].seed].seconds + seconds
             continue
-        cells = [cell for group in made if isinstance(group, list) for cell in group]
+        cells = [cell for group in results if isinstance(group, list) for cell in group]
         for cell in cells:
             scene = scenes[cell.task_name, cell.scene.seed]
             scene.cells.append(cell)
             scene.seconds += seconds / len(cells)
-            if scene.is_simulated:
+            if len(scene.cells) == len(scene.job.robots):
                 work.appendleft(partial(_write, scene.ordered_cells, scene.job.rejected, production))
 
 
-def _call(unit: Callable[[], Outcome]) -> Outcome:
-    return unit()
-
-
 def _simulate(share: Sequence[Job], production: Production) -> Outcome:
-    """Plan and simulate a share, in a worker process."""
+    """Plan and simulate a share in a worker process."""
     begin = time.perf_counter()
     cells = simulate_jobs(share, production)
     return cells, time.perf_counter() - begin
 
 
 def _write(cells: Sequence[Cell], rejected: bool, production: Production) -> Outcome:
-    """Render and write a scene, in a worker process, on its own device."""
+    """Render and write a scene in a worker process, on its own device."""
     begin = time.perf_counter()
     records = write_scene(cells, production.out, _renderer(production.gpu_physics), rejected=rejected, videos=production.videos)
     return records, time.perf_counter() - begin
@@ -129,13 +112,13 @@ def _write(cells: Sequence[Cell], rejected: bool, production: Production) -> Out
 
 @cache
 def _renderer(gpu_physics: bool) -> Renderer:
-    """The renderer of a worker process on its own device, made once; smaller where many workers share a GPU."""
+    """The renderer of a worker process on its own device; smaller if many workers share a GPU."""
     only_renders = wp.get_device().is_cuda and not gpu_physics
     return Renderer(frames_per_chunk=FRAMES_OF_A_RENDERING_WORKER if only_renders else None)
 
 
 def simulate_jobs(jobs: Sequence[Job], production: Production) -> list[list[Cell]]:
-    """The cells of each job with the motion that physics made of their plans."""
+    """The simulated cells of each job."""
     cells = plan_cells(jobs, production.robots, production.physics)
     return simulate_cells(cells, production.physics, production.batch)
 
@@ -143,17 +126,12 @@ def simulate_jobs(jobs: Sequence[Job], production: Production) -> list[list[Cell
 def write_scene(
     cells: Sequence[Cell], out: Path, renderer: Renderer, *, rejected: bool = False, videos: bool = True
 ) -> list[Record]:
-    """Render and write the simulated cells of one scene; their headers, in the same order.
+    """Render and write the simulated cells of one scene; returns their headers in the same order.
 
-    Args:
-        cells: of all robots that the scene still lacked.
-        out: folder of the data set.
-        renderer: draws the pictures.
-        rejected: whether a robot has failed that is not among the cells; then nothing is rendered.
-        videos: as of `Production`.
+    Nothing is rendered if a cell has failed, or if the scene is `rejected` by the failure of another robot.
     """
     accepted = not rejected and not any(cell.failure for cell in cells)
     pixels = render_cells(cells, renderer) if accepted else [None] * len(cells)
-    with ThreadPoolExecutor(usable_cores()) as pool:  # codecs, zlib and hashes let go of the interpreter's lock
+    with ThreadPoolExecutor(usable_cores()) as pool:  # codecs, zlib and hashes release the interpreter's lock
         writing = [pool.submit(write_cell, *pair, out, renderer.device, videos) for pair in zip(cells, pixels, strict=True)]
         return [future.result() for future in writing]

@@ -1,8 +1,4 @@
-"""Episodes on disk, made again: their pixels from recorded states, their videos on demand, and a check of their motion.
-
-Reads  <data>/<task>/<seed>/<robot>/
-Writes pixels whose hashes agree with the recorded ones and, where asked, the videos of an episode without any
-"""
+"""Re-rendering of episodes from recorded states, missing videos, and the plausibility check of their motion."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -32,13 +28,13 @@ from xew.sim_warp.tasks import recorded_task
 
 
 def render_again(folder: Path, renderer: Renderer) -> tuple[np.ndarray, np.ndarray]:
-    """Make an episode's pixels, mask and keypoints anew from its recorded joints, objects and commands.
+    """Render an episode's pixels, mask and keypoints again from its recorded joints, objects and commands.
 
     Returns:
         The head camera's and the robot's video [t h w 3] uint8, whose hashes agree with the recorded ones.
 
     Raises:
-        EpisodeError: the scene or anything rendered differs from what is recorded.
+        EpisodeError: the scene or a hash differs from the recorded one.
     """
     record = read_record(folder)
     robot = recorded_robot(record.robot, data_folder(folder))
@@ -52,14 +48,14 @@ def render_again(folder: Path, renderer: Renderer) -> tuple[np.ndarray, np.ndarr
     for name, recorded in (record.hashes | {"scene": record.scene_hash}).items():
         if hashes[name] != recorded:
             raise EpisodeError(
-                f"{folder}: rendered again on {renderer.device.name}, {name} has hash {hashes[name][:12]}, recorded on "
-                f"{record.device} was {recorded[:12]}; with the same device and versions they must agree."
+                f"{folder}: rendered again on {renderer.device.name}, {name} has hash {hashes[name][:12]}, expected "
+                f"{recorded[:12]} as recorded on {record.device}. Use the same device and versions as for the recording."
             )
     return view.rgb, render
 
 
 def add_videos(folder: Path, renderer: Renderer) -> None:
-    """Make and store the videos of an episode that was written without. Raises EpisodeError as `render_again`."""
+    """Make and store the videos of an episode without videos. Raises EpisodeError as `render_again`."""
     record = read_record(folder)
     if not record.videos:
         rgb, robot = render_again(folder, renderer)
@@ -67,7 +63,7 @@ def add_videos(folder: Path, renderer: Renderer) -> None:
 
 
 def demand_plausible(folder: Path) -> None:
-    """Raise EpisodeError if an accepted episode's states hold what could not have happened (plausibility.py)."""
+    """Raise EpisodeError if an accepted episode's motion is implausible (plausibility.py)."""
     record, states = read_record(folder), read_states(folder)
     scene = _sample_again(folder, record)
     plan = recorded_task(record.task).plan(scene)
@@ -85,7 +81,7 @@ def _sample_again(folder: Path, record: Record) -> Scene:
     scene = recorded_task(record.task).sample(scene_rng(record.task, record.seed), record.seed)
     if scene.names != record.object_names:
         raise EpisodeError(
-            f"{folder} has the objects {', '.join(record.object_names)}, {record.task} makes {', '.join(scene.names)} of its "
-            "seed now: the task has changed. Use the xew that made the episode, or delete it and run generate again."
+            f"{folder} has the objects {', '.join(record.object_names)}, {record.task} now makes {', '.join(scene.names)}: "
+            "the task has changed. Use the version of xew that made the episode, or delete it and run generate again."
         )
     return scene

@@ -1,10 +1,4 @@
-"""Scheduling of seeds: which seeds of a task are tried, what is missing of them, and when there are enough.
-
-Reads  headers of what is on disk, and the manifest of seeds that are known to fail
-Writes `Job`s
-
-Seeds are tried in order until enough are accepted, that is, until all robots have succeeded on them.
-"""
+"""Scheduling of seeds: they are tried in order until enough are accepted. A seed is accepted if all robots succeed on it."""
 
 import itertools
 from collections import defaultdict
@@ -18,16 +12,16 @@ from xew.sim_warp.production.cells import Job
 
 TRIES_PER_SEED = 3
 SPARE_TRIES = 20
-"""Numbers of seeds after which a task gives up: 3 n + 20 have been tried and fewer than n accepted."""
+"""A task fails if 3 n + 20 seeds have been tried and fewer than n accepted."""
 SEEDS_OF_ROBOT = 1000
-"""Number of seeds from the first of one robot to the first of the next where robots share no scenes."""
+"""Distance between the first seeds of two robots that share no scenes."""
 MOST_UNPAIRED = (SEEDS_OF_ROBOT - SPARE_TRIES) // TRIES_PER_SEED
-"""Largest number of accepted seeds that fit between them."""
+"""Largest number of accepted seeds per robot that share no scenes."""
 
 
 @dataclass
 class Family:
-    """The seeds of one task and family (`xew.protocol.seed_split`), and how far they are."""
+    """The seeds of one task and family (`xew.protocol.seed_split`), with their records."""
 
     task: str
     first_seed: int
@@ -36,11 +30,11 @@ class Family:
     failing: frozenset[int] = frozenset()
     """Seeds on which one of the robots is known to fail."""
     motion: str = SHARED_MOTION
-    """Kind of motion of what is missing."""
+    """Kind of motion of new episodes."""
     done: dict[int, dict[str, Record]] = field(default_factory=lambda: defaultdict(dict))
 
     def add(self, record: Record) -> None:
-        """Take a cell into account."""
+        """Add the record of a cell."""
         self.done[record.seed][record.robot] = record
 
     @property
@@ -51,13 +45,13 @@ class Family:
 
     @property
     def accepted(self) -> int:
-        """Number of complete seeds on which no robot failed, at most as many as are wanted."""
+        """Number of complete seeds on which no robot failed, at most `wanted`."""
         return min(self.wanted, sum(not self._missing_robots(seed) and self._is_hopeful(seed) for seed in list(self.done)))
 
     def next_jobs(self) -> list[Job]:
-        """What is missing of the first seeds: as many as it takes if from now on no robot fails.
+        """Missing cells of the first seeds, enough if no further robot fails.
 
-        Seeds on which a robot has failed are completed too, so that a run that was stopped ends like one that was not.
+        Failed seeds are completed too: an interrupted run ends like an uninterrupted one.
         """
         jobs: list[Job] = []
         hopeful = 0
@@ -70,7 +64,7 @@ class Family:
         return jobs
 
     def _missing_robots(self, seed: int) -> tuple[str, ...]:
-        """Robots without a record or, where all have succeeded, without an episode."""
+        """Robots without a record or, if all have succeeded, without an episode."""
         done = self.done[seed]
         return tuple(r for r in self.robots if r not in done or (self._is_hopeful(seed) and not done[r].hashes))
 
@@ -88,15 +82,9 @@ def plan_families(
     motion: str = SHARED_MOTION,
     unpaired: bool = False,
 ) -> list[Family]:
-    """The families of all tasks: one of all robots together, or one a robot, each with seeds that no other has.
+    """The families of all tasks: one for all robots, or with `unpaired` one per robot with different seeds.
 
-    Args:
-        tasks: keys of the tasks.
-        wanted_seeds: numbers of accepted seeds by family of seeds, a key of SEED_STARTS.
-        robots: keys of the robots by family of seeds.
-        manifest: seeds that are known to fail.
-        motion: kind of motion of what is missing.
-        unpaired: whether each robot has seeds of its own.
+    `wanted_seeds` (numbers of accepted seeds) and `robots` (their keys) are by family of seeds, the keys of SEED_STARTS.
     """
     families = []
     for task in dict.fromkeys(tasks):
@@ -111,7 +99,7 @@ def plan_families(
 
 
 def demand_enough(families: Sequence[Family]) -> None:
-    """Raise EpisodeError where the tries of a task are used up."""
+    """Raise EpisodeError if a family has too few accepted seeds."""
     short = [
         f"{family.task} with {', '.join(family.robots)}: only {family.accepted} of {family.wanted} seeds were accepted in"
         f" {len(family.tries)} tries."
@@ -119,4 +107,4 @@ def demand_enough(families: Sequence[Family]) -> None:
         if family.accepted < family.wanted
     ]
     if short:
-        raise EpisodeError("\n".join([*short, "The table shows why; make the task easier or leave out a robot."]))
+        raise EpisodeError("\n".join([*short, "The table shows why; make the task easier or exclude a robot."]))

@@ -1,8 +1,6 @@
-"""Points on surfaces of episodes on disk, and how many of them the camera sees.
+"""Surface points of episodes on disk, and their visibility.
 
-Reads  <data>/<task>/<seed>/<robot>/
-Writes nothing beside the episodes: the points follow from recorded states and from the shapes of the robot and of the task's
-       objects, so that episodes of earlier versions have them too. A folder may be named that keeps them (kept_tracks.py)
+Points are computed from recorded states and the shapes of the robot and objects; kept_tracks.py can store them.
 """
 
 from collections import defaultdict
@@ -18,7 +16,6 @@ from xew.sim_warp.embodiment.spec import RobotSpec
 from xew.sim_warp.geometry.camera import Camera
 from xew.sim_warp.production.kept_tracks import load_tracks, save_tracks, tracks_key, tracks_path
 from xew.sim_warp.rendering.observe import scene_recording
-from xew.sim_warp.rendering.render import Renderer
 from xew.sim_warp.rendering.streams import default_renderer
 from xew.sim_warp.rendering.surfaces import MOVED, MOVING, SurfaceTracks, track_surfaces
 from xew.sim_warp.robots import recorded_robot
@@ -28,40 +25,35 @@ from xew.sim_warp.tasks import recorded_task
 
 @dataclass(frozen=True)
 class Seen:
-    """How well one thing, or the robot, is seen in some frames."""
+    """Visibility of one object or the robot in some frames."""
 
     points: np.ndarray
     """[m] int, visible points on it."""
     pixels: np.ndarray
-    """[m] int, pixels that show it."""
+    """[m] int, its pixels."""
 
 
 @dataclass(frozen=True)
 class Visibility:
-    """How well an episode's surfaces are seen."""
+    """Visibility of an episode's surfaces."""
 
     robot: Seen
     """In all frames."""
     things: dict[str, Seen]
-    """Each thing that moves, in its moving frames, by name."""
+    """Moving objects in their moving frames, by name."""
 
 
 def scene_names(scene: Scene) -> tuple[str, ...]:
-    """Names of the bodies of `rendering.observe.scene_things`: the objects, then the lids of those that have a hinge."""
+    """Names of the bodies of `rendering.observe.scene_things`: the objects, then the lids of hinged objects."""
     return *scene.names, *(f"{thing.name} lid" for thing in scene.objects if thing.hinge is not None)
 
 
-def read_surfaces(folder: Path, renderer: Renderer | None = None, keep: Path | None = None) -> SurfaceTracks | None:
-    """Points on the surfaces of an accepted episode.
-
-    Args:
-        folder: of the episode.
-        renderer: whose buffer says what is seen; by default the process's own.
-        keep: folder that keeps tracks; what it has of this episode is not rendered again. None keeps nothing.
+def read_surfaces(folder: Path, keep: Path | None = None) -> SurfaceTracks | None:
+    """Surface tracks of an accepted episode, read from or written to the store `keep`, if given.
 
     Returns:
-        The tracks; None where the shapes are not known: the episode was imported, or is not of the scene that its task now
-        makes of its seed, or there is no such task or robot here.
+        None if the shapes are unknown: the episode was imported, its task now makes another scene of its seed, or its task or
+        robot does not exist.
 
     Raises:
         EpisodeError: a file is missing or damaged.
@@ -73,37 +65,37 @@ def read_surfaces(folder: Path, renderer: Renderer | None = None, keep: Path | N
         robot = recorded_robot(record.robot, data_folder(folder))
     except UntrustedError:
         raise
-    except ConfigError:  # of a task or robot that is not known here
+    except ConfigError:  # unknown task or robot
         scene = None
     if scene is None:
         return None
     states = read_states(folder)
     if keep is None:
-        return _render_surfaces(robot, scene, states, renderer)
+        return _render_surfaces(robot, scene, states)
     path, key = tracks_path(keep, record), tracks_key(robot, record.scene_hash, states)
     tracks = load_tracks(path, key)
     if tracks is None:
-        tracks = _render_surfaces(robot, scene, states, renderer)
+        tracks = _render_surfaces(robot, scene, states)
         save_tracks(path, key, tracks)
     return tracks
 
 
-def _render_surfaces(robot: RobotSpec, scene: Scene, states: States, renderer: Renderer | None) -> SurfaceTracks:
-    """The tracks of an episode of a scene, by its states."""
+def _render_surfaces(robot: RobotSpec, scene: Scene, states: States) -> SurfaceTracks:
+    """The tracks of an episode from its states."""
     recording = scene_recording(robot, scene, states.joint_pos, states.object_pose, states.object_joint)
     height, width = states.robot_mask.shape[1:]
     camera = Camera(states.intrinsics, states.extrinsics, width, height)
-    return track_surfaces([recording], [scene_names(scene)], renderer or default_renderer(), camera)[0]
+    return track_surfaces([recording], [scene_names(scene)], default_renderer(), camera)[0]
 
 
 def _find_scene(record: Record) -> Scene | None:
-    """The scene of an episode; None where its task makes another of its seed now."""
+    """The scene of an episode; None if its task now makes another scene of its seed."""
     scene = recorded_task(record.task).sample(scene_rng(record.task, record.seed), record.seed)
     return scene if scene.names == record.object_names and scene_hash(scene) == record.scene_hash else None
 
 
 def count_visible(tracks: SurfaceTracks) -> Visibility:
-    """Visible points and pixels of the robot by frame, and of each thing that moves by moving frame."""
+    """Visible points and pixels of the robot by frame, and of each moving object by moving frame."""
     bodies = range(len(tracks.names))
     points = np.stack([tracks.visible[:, tracks.body == b].sum(axis=1) for b in bodies], axis=1)
     pixels = np.stack([np.sum(tracks.shown == b, axis=(1, 2)) for b in bodies], axis=1)
@@ -114,11 +106,11 @@ def count_visible(tracks: SurfaceTracks) -> Visibility:
 
 
 def read_visibility(folders: Sequence[Path], keep: Path | None = None) -> dict[tuple[str, str], list[Visibility]]:
-    """Visibility of episodes by task and robot, without those whose shapes are not known. Raises as `read_surfaces`."""
-    found: dict[tuple[str, str], list[Visibility]] = defaultdict(list)
+    """Visibility of episodes with known shapes, by task and robot. Raises as `read_surfaces`."""
+    visibility: dict[tuple[str, str], list[Visibility]] = defaultdict(list)
     for folder in folders:
         tracks = read_surfaces(folder, keep=keep)
         if tracks is not None:
             record = read_record(folder)
-            found[record.task, record.robot].append(count_visible(tracks))
-    return dict(sorted(found.items()))
+            visibility[record.task, record.robot].append(count_visible(tracks))
+    return dict(sorted(visibility.items()))

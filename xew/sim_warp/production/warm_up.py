@@ -1,10 +1,6 @@
-"""Warp's kernels, compiled before the first job where a machine has none: each part of the work does its smallest piece.
+"""Compilation of Warp's kernels before the first job, if a machine has none: each part of the work runs its smallest job.
 
-Reads  nothing
-Writes Warp's kernel cache, from which all workers load
-
-Each part is a job of its own, in a process of its own, because some of what Warp compiles (products of small matrices) it
-compiles one at a time in a process.
+Each part runs in a separate process, because Warp compiles products of small matrices one at a time per process.
 """
 
 import sys
@@ -15,7 +11,6 @@ import numpy as np
 import warp as wp
 from tqdm import tqdm
 
-from xew.protocol import ACTION_DIM, ARMS
 from xew.sim_warp.devices.kernels import has_kernels
 from xew.sim_warp.devices.workers import Workers
 from xew.sim_warp.embodiment.spec import RobotSpec
@@ -24,24 +19,21 @@ from xew.sim_warp.kinematics.inverse import arm_solver
 from xew.sim_warp.physics import World, simulate
 from xew.sim_warp.rendering.observe import Recording, observe
 from xew.sim_warp.rendering.render import Renderer
+from xew.sim_warp.rendering.streams import home_action
 from xew.sim_warp.robots import ROBOTS
 from xew.sim_warp.scene import scene_rng
 from xew.sim_warp.tasks import TASKS
 
 PARTS = ("physics", "kinematics", "rendering")
-"""Parts of the work, the one that compiles longest first."""
+"""Parts of the work, by decreasing compile time."""
 ROBOT, TASK = "franka_panda", "open_laptop"
-"""The pieces' robot and scene; which they are does not matter, since kernels serve all."""
+"""Robot and task of the smallest jobs; kernels serve all robots and tasks."""
 
 
 def compile_kernels(workers: Workers, device: wp.Device, batch: int, parts: Sequence[str] = PARTS) -> None:
-    """Compile the kernels of these parts, where there are none for this kind of device yet, and show how far that is.
+    """Compile the kernels of some of PARTS, one per worker, unless this kind of device has kernels.
 
-    Args:
-        workers: processes that do it, a part each.
-        device: that the kernels are for.
-        batch: number of worlds that a GPU steps together, for which its kernels are compiled.
-        parts: those of PARTS that will be needed.
+    `batch` is the number of worlds that a GPU steps together; its kernels depend on it.
     """
     if has_kernels(device):
         return
@@ -52,18 +44,13 @@ def compile_kernels(workers: Workers, device: wp.Device, batch: int, parts: Sequ
 
 
 def compile_on_devices(workers: Workers, devices: Mapping[str, str], batch: int) -> None:
-    """`compile_kernels`, where parts of the work are done on devices of their own.
-
-    Args:
-        workers, batch: as of `compile_kernels`.
-        devices: Warp's name of the device of each part.
-    """
+    """`compile_kernels` for the device, by Warp's name, of each part."""
     for name in dict.fromkeys(devices.values()):
         compile_kernels(workers, wp.get_device(name), batch, [part for part, alias in devices.items() if alias == name])
 
 
 def do_smallest_piece(part: str, device: str, batch: int) -> None:
-    """Do the smallest piece of a part of the work, one of PARTS, with all kernels that the part uses."""
+    """Run the smallest job of one of PARTS, with all of its kernels."""
     robot = ROBOTS[ROBOT]
     {"physics": _simulate, "kinematics": _solve, "rendering": _render}[part](robot, wp.get_device(device), batch)
 
@@ -82,12 +69,12 @@ def _simulate(robot: RobotSpec, device: wp.Device, batch: int) -> None:
     if not device.is_cuda:
         simulate([world], device.alias)
         return
-    from xew.sim_warp.physics.gpu import Batch  # MuJoCo Warp is heavy, and of no use without a GPU
+    from xew.sim_warp.physics.gpu import Batch  # slow to import, needed on a GPU only
 
     worlds = Batch([world] * batch, device)
     try:
         worlds.compile()
-    except Exception as error:  # whatever it is, running compiles what is missing, only more slowly
+    except Exception as error:  # then `run` compiles the kernels one by one
         print(f"kernels of physics are compiled one after another ({type(error).__name__}: {error})", file=sys.stderr)
     worlds.run()
 
@@ -98,8 +85,4 @@ def _render(robot: RobotSpec, device: wp.Device, batch: int) -> None:
 
 def stand_at_home(robot: RobotSpec, frames: int) -> np.ndarray:
     """[t 16] float32 commands to stand at home with open grippers."""
-    action = np.zeros((frames, ACTION_DIM), np.float32)
-    for arm, (joints, gripper) in zip(robot.arms, ARMS, strict=True):
-        action[:, joints.start : joints.start + robot.arm_joint_count] = arm.home
-        action[:, gripper] = 1.0
-    return action
+    return np.tile(home_action(robot).astype(np.float32), (frames, 1))

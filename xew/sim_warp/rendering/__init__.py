@@ -1,8 +1,7 @@
-"""Posed bodies to images: what the head camera sees of recorded states, and what follows from commands alone.
+"""Rendering of recorded states and of commands: pure, bit-repeatable functions of their inputs.
 
-Every image is a pure, bit-repeatable function of its inputs. Call `observe` and `surfaces` for recorded states and `streams`
-for commands; `render` draws any posed bodies for all three, by the kernels that `passes` launches, of what `bodies`, `packing`
-and `lighting` give it.
+Call `observe` and `surfaces` for recorded states and `streams` for commands. `render` draws posed bodies for all three, with
+the kernels that `passes` launches on the data of `bodies`, `packing` and `lighting`.
 """
 
 __all__ = [

@@ -1,7 +1,4 @@
-"""A robot as the renderer sees it: one body per link that has a shape, posed by canonical joint positions.
-
-Reads a RobotSpec and its URDF; both arms come in one list, the left copy of the URDF first where there are two.
-"""
+"""A robot's bodies for the renderer: one per visible link, posed by canonical joint positions; the left copy first."""
 
 from functools import lru_cache
 
@@ -16,10 +13,10 @@ SIDES = ("left", "right")
 
 
 def robot_bodies(spec: RobotSpec) -> list[Body]:
-    """The robot's visible links, as many and in the order of `robot_pose`. The meshes are shared between calls."""
+    """The robot's visible links in the order of `robot_pose`; calls share the meshes."""
     links = load_urdf(spec.urdf).links
     meshes = {name: link.visual for name, link in links.items() if link.visual is not None}
-    return [Body(meshes[name], is_robot=True) for _, name in _visible_links(spec)]
+    return [Body(meshes[name], is_robot=True) for _, name in body_names(spec)]
 
 
 def robot_pose(spec: RobotSpec, joint_pos: np.ndarray) -> np.ndarray:
@@ -32,37 +29,29 @@ def robot_pose(spec: RobotSpec, joint_pos: np.ndarray) -> np.ndarray:
         [t b 7] float32, xyz [m] and quaternion xyzw.
     """
     poses = link_poses(spec, joint_pos)
-    return np.stack([poses[copy][link] for copy, link in _visible_links(spec)], 1).astype(np.float32)
+    return np.stack([poses[copy][link] for copy, link in body_names(spec)], 1).astype(np.float32)
 
 
 def keypoint_links(spec: RobotSpec) -> list[tuple[int, str, str]]:
-    """The links whose origins are keypoints: (copy of the URDF, name of the link, name of the keypoint).
-
-    They are the links that the joints of each arm and its fingers move, from the base outwards; the names of their
-    keypoints, such as left/link3, say whose they are.
-    """
+    """Keypoints as (copy of the URDF, link, name such as left/link3): the child links of each arm's joints and fingers."""
     urdf = load_urdf(spec.urdf)
-    found = []
+    keypoints = []
     for index, (side, arm) in enumerate(zip(SIDES, spec.arms, strict=True)):
         copy = 0 if spec.one_urdf_holds_both_arms else index
         links = [urdf.joints[joint].child for joint in (*arm.joints, *arm.fingers)]
-        found += [(copy, link, f"{side}/{link}") for link in links]
-    return found
-
-
-def body_names(spec: RobotSpec) -> list[tuple[int, str]]:
-    """(copy of the URDF, link) of each body of `robot_bodies`."""
-    return list(_visible_links(spec))
+        keypoints += [(copy, link, f"{side}/{link}") for link in links]
+    return keypoints
 
 
 @lru_cache(maxsize=256)
-def _visible_links(spec: RobotSpec) -> tuple[tuple[int, str], ...]:
+def body_names(spec: RobotSpec) -> tuple[tuple[int, str], ...]:
+    """(copy of the URDF, link) of each body of `robot_bodies`."""
     urdf = load_urdf(spec.urdf)
     copies = 1 if spec.one_urdf_holds_both_arms else 2
     return tuple((copy, name) for copy in range(copies) for name, link in urdf.links.items() if link.visual is not None)
 
 
 def nearby_links(urdf: Urdf, link: str) -> set[str]:
-    """A link and those that one joint joins to it."""
+    """A link and its neighbors."""
     joined = {joint.parent for joint in urdf.joints.values() if joint.child == link}
     return joined | {joint.child for joint in urdf.joints.values() if joint.parent == link} | {link}

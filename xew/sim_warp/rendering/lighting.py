@@ -1,4 +1,4 @@
-"""The camera, the lights and the looks of the stage, as the kernels take them."""
+"""Camera, lights and shading of the stage as arguments of the kernels."""
 
 import numpy as np
 import warp as wp
@@ -13,7 +13,7 @@ SHADOW_SIZE = 512
 
 
 def camera_view(camera: Camera) -> raster.View:
-    """The camera as the kernels take it."""
+    """The camera as an argument of the kernels."""
     view = raster.View()
     view.rotation = wp.mat33(*camera.extrinsics[:3, :3].ravel())
     view.translation = wp.vec3(*camera.extrinsics[:3, 3])

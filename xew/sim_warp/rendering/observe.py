@@ -1,8 +1,4 @@
-"""What the head camera sees of recorded states: a pure function of them.
-
-Reads  `Recording`s: a robot, its measured joints, and things with their measured poses
-Writes `Observation`s: RGB, robot mask, keypoints and their visibility, as `xew.episode.States` keeps them
-"""
+"""The head camera's observations, pure functions of recorded states."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,25 +16,25 @@ from xew.sim_warp.rendering.render import Body, Frames, Renderer, World
 from xew.sim_warp.scene import Hinge, Scene
 
 VISIBILITY_MARGIN = 0.02
-"""Distance in front of a link's origin beyond which something else hides the link [m]."""
+"""Distance in front of a link's origin beyond which another surface hides the link [m]."""
 
 
 @dataclass(frozen=True)
 class Recording:
-    """One episode to look at: a robot and things, posed as measured."""
+    """One episode to render: a robot and objects, posed as measured."""
 
     robot: RobotSpec
     joint_pos: np.ndarray
     """[t 16] measured canonical joint positions [rad] and grippers [0 closed, 1 open]."""
     things: Sequence[Body] = ()
-    """All bodies that are not the robot; keep the `Mesh` objects of equal things, they are stored once."""
+    """All bodies that are not the robot; equal `Mesh` objects are stored once."""
     thing_pose: np.ndarray | None = None
-    """[t o 7] their measured poses, xyz [m] and quaternion xyzw, world; None if there are none."""
+    """[t o 7] their measured poses, xyz [m] and quaternion xyzw, world, if any."""
 
 
 @dataclass(frozen=True)
 class Observation:
-    """What the camera sees of one episode, as `xew.episode.States` names it."""
+    """The camera's observation of one episode, with the names of `xew.episode.States`."""
 
     rgb: np.ndarray
     """[t h w 3] uint8, sRGB."""
@@ -51,9 +47,9 @@ class Observation:
 
 
 def observe(renderer: Renderer, recordings: Sequence[Recording], camera: Camera = HEAD_CAMERA) -> list[Observation]:
-    """Look at many episodes at once; the result of each does not depend on the others."""
+    """Observe many episodes at once; the result of each does not depend on the others."""
     points = [keypoint_positions(recording.robot, recording.joint_pos) for recording in recordings]
-    worlds = [_world(recording, at) for recording, at in zip(recordings, points, strict=True)]
+    worlds = [recording_world(recording, at) for recording, at in zip(recordings, points, strict=True)]
     frames = renderer.render_batch(worlds, camera)
     return [_observation(*seen, camera) for seen in zip(recordings, points, frames, strict=True)]
 
@@ -61,7 +57,7 @@ def observe(renderer: Renderer, recordings: Sequence[Recording], camera: Camera 
 def scene_recording(
     robot: RobotSpec, scene: Scene, joint_pos: np.ndarray, object_pose: np.ndarray, object_joint: np.ndarray
 ) -> Recording:
-    """What the camera looks at, from recorded states.
+    """A recording from recorded states.
 
     Args:
         joint_pos: [t 16] canonical joint positions [rad] and grippers [0 closed, 1 open].
@@ -73,7 +69,7 @@ def scene_recording(
 
 
 def scene_things(scene: Scene, object_pose: np.ndarray, object_joint: np.ndarray) -> tuple[list[Body], np.ndarray]:
-    """The objects of a scene as bodies with poses, lids as bodies of their own.
+    """The objects of a scene, then their lids, as bodies with poses.
 
     Args:
         object_pose: [t o 7] recorded poses of the objects, xyz [m] and quaternion xyzw, world.
@@ -113,13 +109,9 @@ def keypoint_positions(robot: RobotSpec, joint_pos: np.ndarray) -> np.ndarray:
 
 
 def keypoint_visibility(robot: RobotSpec, points: np.ndarray, frames: Frames, camera: Camera) -> np.ndarray:
-    """Which keypoints the camera sees, bool [t k].
+    """Visibility bool [t k] of keypoints [t k 3] m, world, which were given to the renderer with the frames.
 
-    A link's origin lies inside the link, so it counts as seen where the pixel that holds it shows the link itself or
-    one that a joint joins to it, or where what the pixel shows is no more than `VISIBILITY_MARGIN` in front of it.
-
-    Args:
-        points: [t k 3] keypoints [m], world, as given to the renderer with the frames.
+    A keypoint is visible if its pixel shows its link or a neighboring link, or a surface at most `VISIBILITY_MARGIN` in front.
     """
     _, depth = project(camera, points)
     shown = frames.point_body
@@ -141,7 +133,8 @@ def _own_table(robot: RobotSpec) -> np.ndarray:
     return table
 
 
-def _world(recording: Recording, points: np.ndarray) -> World:
+def recording_world(recording: Recording, points: np.ndarray | None = None) -> World:
+    """A recording as the renderer takes it, the robot's bodies first; `points` [t k 3] m, world, are looked up."""
     bodies = [*robot_bodies(recording.robot), *recording.things]
     pose = robot_pose(recording.robot, recording.joint_pos)
     if recording.thing_pose is not None:

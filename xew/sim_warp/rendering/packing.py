@@ -1,7 +1,4 @@
-"""From Python objects to the renderer's device arrays: geometry and poses of many worlds, packed end to end.
-
-Worlds that show the same meshes share one copy of them, so that hundreds of episodes of one robot cost one robot.
-"""
+"""Packing of geometry and poses of many worlds into device arrays; worlds with equal meshes share one copy."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,7 +13,7 @@ from xew.sim_warp.stage import linear_from_srgb
 
 @dataclass(frozen=True)
 class Body:
-    """Something rigid that can be seen. Keep one `Mesh` object for one shape: equal objects are stored once."""
+    """A visible rigid body; bodies with the same `Mesh` object share its storage."""
 
     mesh: Mesh
     """In the frame of the body."""
@@ -25,7 +22,7 @@ class Body:
 
 @dataclass(frozen=True)
 class World:
-    """One episode to render: bodies, and where they are at each frame."""
+    """One episode to render: bodies and their poses at each frame."""
 
     bodies: Sequence[Body]
     pose: np.ndarray
@@ -36,14 +33,14 @@ class World:
 
 @dataclass(frozen=True)
 class FrameTable:
-    """All frames of all worlds in order: where their geometry and poses are."""
+    """Indices of the geometry and poses of all frames of all worlds, in order."""
 
     world: np.ndarray
     """[t] int32 index of each frame's world among the packed geometry's distinct worlds."""
     pose: np.ndarray
     """[t] int32 index of the frame's first body in the packed poses."""
     next_pose: np.ndarray
-    """[t] int32 the same of the world's next frame; the last frame's next is itself."""
+    """[t] int32 the same for the world's next frame; for the last frame its own."""
 
     def select(self, chunk: slice) -> "FrameTable":
         """Some of the frames."""
@@ -62,7 +59,7 @@ class PackedGeometry:
 
 
 def check_world(world: World) -> None:
-    """Raise ValueError where poses or points do not fit the bodies and frames, or are not finite."""
+    """Raise ValueError if poses or points do not fit the bodies and frames, or are not finite."""
     shape = np.shape(world.pose)
     if len(shape) != 3 or shape[1:] != (len(world.bodies), 7):
         raise ValueError(f"pose has shape {shape}, expected (frames, {len(world.bodies)}, 7): one pose for each of the bodies.")
@@ -78,16 +75,16 @@ def check_world(world: World) -> None:
 
 
 def distinct_worlds(worlds: Sequence[World]) -> tuple[list[Sequence[Body]], list[int]]:
-    """The different lists of bodies among the worlds, and which of them each world shows."""
-    found: dict[tuple[tuple[int, bool], ...], int] = {}
+    """The distinct lists of bodies among the worlds, and the index of each world's list."""
+    indices: dict[tuple[tuple[int, bool], ...], int] = {}
     kinds: list[Sequence[Body]] = []
     index = []
     for world in worlds:
         key = tuple((id(body.mesh), body.is_robot) for body in world.bodies)
-        if key not in found:
-            found[key] = len(kinds)
+        if key not in indices:
+            indices[key] = len(kinds)
             kinds.append(world.bodies)
-        index.append(found[key])
+        index.append(indices[key])
     return kinds, index
 
 
@@ -138,10 +135,9 @@ def _ranges(counts: np.ndarray) -> np.ndarray:
 
 
 def pack_frames(worlds: Sequence[World], kind: Sequence[int]) -> tuple[FrameTable, np.ndarray]:
-    """The table of all frames, and all poses [p 7] float32 xyz [m] and quaternion xyzw, world, that it points into.
+    """The table of all frames, and all poses [p 7] float32 xyz [m] and quaternion xyzw, world, that it indexes.
 
-    Args:
-        kind: for each world, its index among the distinct worlds.
+    `kind` is the index of each world among the distinct worlds.
     """
     columns: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
     first = 0

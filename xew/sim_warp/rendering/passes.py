@@ -1,8 +1,4 @@
-"""The passes of the renderer over the frames that are on the device at once: each launches kernels and leaves arrays there.
-
-Reads  packed geometry and poses (packing.py), the camera and the lights (lighting.py)
-Writes visibility and shadow maps (`Passes.draw`), then colors, masks, depth, optical flow and what is seen at points
-"""
+"""The renderer's passes over a chunk of frames on the device: visibility and shadow maps (`Passes.draw`), then images."""
 
 from dataclasses import dataclass
 
@@ -19,27 +15,27 @@ from xew.sim_warp.rendering.packing import Body, FrameTable, PackedGeometry, Wor
 FLOW_LIMIT = 25.0
 """Longest optical flow [pixels], the paper's clip."""
 STRIPES = {"cpu": 1, "cuda": 8}
-"""Number of threads that share a triangle's rows, so that one large triangle does not hold up a GPU."""
+"""Number of threads per triangle; a GPU splits large triangles by rows."""
 IDENTITY = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 
 @dataclass(frozen=True)
 class Call:
-    """What is the same for all frames of a call of the renderer."""
+    """Arguments of the renderer for all frames of a call."""
 
     geometry: PackedGeometry
     pose: wp.array
     """[P] wp.transform, poses of the bodies of all frames, world."""
     camera: Camera
     view: raster.View
-    """The camera as the kernels take it."""
+    """The camera as an argument of the kernels."""
     stage: shading.LitStage
     shadows: int = 0
-    """Number of lights whose shadow maps are drawn."""
+    """Number of lights with shadow maps."""
     wanted: frozenset[str] = frozenset()
-    """Names of the optional images of `render.Frames` that are made."""
+    """Names of the requested optional images of `render.Frames`."""
     colors: bool = True
-    """Whether colors are made."""
+    """Whether colors are requested."""
 
 
 class Chunk:
@@ -56,7 +52,7 @@ class Chunk:
 
 @dataclass(frozen=True)
 class Drawn:
-    """What `Passes.draw` leaves for the kernels after it, as they describe it in raster_kernels.py."""
+    """Output of `Passes.draw` for the next kernels, see raster_kernels.py."""
 
     vertex: wp.array
     """[n v] wp.vec3, m, camera's frame."""
@@ -71,7 +67,7 @@ class Drawn:
 
 
 class Passes:
-    """The kernels of the renderer on one device, with what they need of the stage."""
+    """The renderer's kernels on one device, with lights and shading of the stage."""
 
     def __init__(self, device: wp.Device) -> None:
         self.device = device
@@ -126,7 +122,7 @@ class Passes:
         return rgb
 
     def measure(self, call: Call, chunk: Chunk, drawn: Drawn) -> dict[str, wp.array]:
-        """Masks of a chunk's frames and, as far as wanted, bodies, depth [m] (all [t h w]) and optical flow [t h w 2] px."""
+        """Masks of a chunk's frames and, if requested, bodies, depth [m] (all [t h w]) and optical flow [t h w 2] px."""
         shape = (chunk.count, call.camera.height, call.camera.width)
         posed = [call.geometry.arrays, chunk.world, chunk.pose, chunk.next_pose, call.pose, call.view]
         images = {"robot_mask": self._empty(shape, wp.bool)}
@@ -153,7 +149,7 @@ class Passes:
         return images
 
     def light_stage(self, camera: Camera, ground: bool) -> shading.LitStage:
-        """What never moves as this camera sees it, drawn and lit; without a ground there is nothing of it."""
+        """The lit stage in the view of a camera; empty without a ground."""
         bodies = [Body(stage.stage_mesh(), False)] if ground else []
         table, pose = pack_frames([World(bodies, np.tile(IDENTITY, (1, len(bodies), 1)))], [0])
         call = Call(

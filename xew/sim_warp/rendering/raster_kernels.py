@@ -1,9 +1,8 @@
-"""Warp kernels that find which triangle each sample of an image shows, and that draw shadow maps; `passes.py` launches them.
+"""Warp kernels that find the triangle of each image sample and draw shadow maps; `passes.py` launches them.
 
-All kernels of a chunk of frames run together, and a chunk mixes frames of different worlds. A sample of the image keeps
-one 64-bit key: the bits of 1 / depth over the index of the triangle. Keys meet in an atomic maximum, which has no order,
-so an image has the same bytes whatever the device's schedule and whatever else is in the chunk. Colors are made
-afterwards (shading_kernels.py). Triangles are counter-clockwise seen from outside.
+A chunk mixes frames of different worlds. A sample has one 64-bit key: the bits of 1 / depth over the index of the triangle.
+Keys are combined by an atomic maximum, which is independent of order: an image's bytes do not depend on the schedule or
+the chunk. shading_kernels.py makes colors afterwards. Triangles are counter-clockwise seen from outside.
 
 Frames of reference: the world (z up); the camera's frame (x right, y down, z forward); pixels (x right, y down), in which
 the center of the first pixel is (0, 0). Letters of shapes: n frames of the chunk, l lights, v vertices and f triangles of the
@@ -16,8 +15,8 @@ V vertices, F triangles, B bodies and W worlds of all distinct worlds, P poses o
 
 import warp as wp
 
-# Nobody differentiates images, and half the code compiles in half the time. Without fused multiply-adds, and with no
-# function but + - * / and sqrt, every processor that keeps to IEEE 754 makes the same bytes.
+# No gradients: halves the compile time. Without fused multiply-adds and functions other than + - * / and sqrt, all IEEE 754
+# processors make the same bytes.
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 NEAR = wp.constant(0.1)
@@ -30,7 +29,7 @@ OFFSET_X = wp.constant(vec5(-0.125, 0.375, -0.375, 0.125, 0.0))
 OFFSET_Y = wp.constant(vec5(-0.375, -0.125, 0.125, 0.375, 0.0))
 CENTER = wp.constant(4)
 TILE = wp.constant(16)
-"""Side of the shadow map's tiles [texels]; a tile knows its nearest depth, so that most lookups end there."""
+"""Side of the shadow map's tiles [texels]; most lookups end at a tile's nearest depth."""
 SHADOW_FAR = wp.constant(8.0)
 """Depth at which the directional light's shadow map ends [m]."""
 
@@ -127,7 +126,7 @@ def place_vertices(
 
 @wp.func
 def crossing(p: wp.vec3, q: wp.vec3, y: float) -> float:
-    """x at which an edge meets a scanline; the ends are put in order so that both neighbors get the same bits."""
+    """x at which an edge meets a scanline; the ordered ends give both neighbors the same bits."""
     if p[1] < q[1]:
         return p[0] + (q[0] - p[0]) * ((y - p[1]) / (q[1] - p[1]))
     return q[0] + (p[0] - q[0]) * ((y - q[1]) / (p[1] - q[1]))
@@ -294,8 +293,8 @@ def draw_shadows(
     map_out: wp.array4d(dtype=wp.uint32),  # [n l m m] uint32 bits of the nearness of the nearest caster, 0 for none
     tile_out: wp.array4d(dtype=wp.uint32),  # [n l q q] uint32 bits of the largest nearness in and round each tile
 ):
-    """Draw shadow maps. Only faces turned away from the light cast: lit faces are then clear of their own depth, which
-    saves a bias, and shadows still begin where things touch the table."""
+    """Draw shadow maps. Only faces turned away from the light cast shadows: lit faces need no depth bias, and shadows begin at
+    contacts with the table."""
     frame, light, triangle = wp.tid()
     owned = geometry.triangle_range[frame_world[frame]]
     if triangle >= owned[1]:

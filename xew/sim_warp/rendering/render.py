@@ -1,12 +1,7 @@
-"""The renderer: posed bodies to images, for observe.py (what the camera sees) and streams.py (what commands say).
+"""The renderer: posed bodies to images, for observe.py (recorded states) and streams.py (commands).
 
-Reads  `World`s: meshes and their poses; a camera; the stage
-Writes `Frames`: RGB, robot mask, depth, bodies, optical flow
-
-It makes two kinds of frame: with the stage (table, wall, ground, shadows) what the head camera sees of an episode, without
-it the bodies alone on white. This file takes worlds apart into chunks of frames and puts their images together again; what is
-done to a chunk lies in passes.py. The kernels (raster_kernels.py, then shading_kernels.py) are the same on CPU and GPU, and
-a frame's bytes do not depend on what else is rendered with it.
+Frames show the stage (table, wall, ground, shadows), or the bodies alone on white. This file splits worlds into chunks of
+frames for passes.py and joins their images. CPU and GPU run the same kernels, and a frame's bytes do not depend on the batch.
 """
 
 from collections.abc import Sequence
@@ -36,9 +31,9 @@ from xew.sim_warp.rendering.passes import FLOW_LIMIT, Call, Chunk, Passes
 __all__ = ["FLOW_LIMIT", "Body", "Frames", "Renderer", "World"]
 
 FRAMES_PER_CHUNK = {"cpu": 4, "cuda": 512}
-"""Number of frames that are on the device at once; one takes about 6 MB."""
+"""Number of frames on the device at once, about 6 MB each."""
 STAGES_KEPT = 16
-"""Number of cameras whose lit stage is kept, about 10 MB each."""
+"""Number of cameras with a cached lit stage, about 10 MB each."""
 
 
 def _nothing() -> np.ndarray:
@@ -47,32 +42,31 @@ def _nothing() -> np.ndarray:
 
 @dataclass(frozen=True)
 class Frames:
-    """Images of one world. What was not asked for has no elements."""
+    """Images of one world; arrays that were not requested are empty."""
 
     rgb: np.ndarray = field(default_factory=_nothing)
     """[t h w 3] uint8, sRGB, anti-aliased."""
     robot_mask: np.ndarray = field(default_factory=_nothing)
-    """[t h w] bool, whether the first thing that the ray through the pixel's center meets is the robot."""
+    """[t h w] bool, whether the ray through the pixel's center meets the robot first."""
     depth: np.ndarray = field(default_factory=_nothing)
-    """[t h w] float32 depth along the optical axis at the pixel's center [m], 0 where nothing is."""
+    """[t h w] float32 depth along the optical axis at the pixel's center [m], 0 for none."""
     body: np.ndarray = field(default_factory=_nothing)
-    """[t h w] int16 index of the body at the pixel's center, -1 where there is none."""
+    """[t h w] int16 index of the body at the pixel's center, -1 for none."""
     optical_flow: np.ndarray = field(default_factory=_nothing)
     """[t h w 2] float32 motion (x right, y down) [pixels] from this frame to the next of the robot's surface point
     under the pixel's center, no longer than `FLOW_LIMIT`; zero off the robot and in the last frame."""
     point_body: np.ndarray = field(default_factory=_nothing)
     """[t k] int32 index of the body seen in the pixel of each of the world's points, -1 none, -2 outside the image."""
     point_depth: np.ndarray = field(default_factory=_nothing)
-    """[t k] float32 depth of what is seen there [m], 0 where nothing is."""
+    """[t k] float32 depth at that pixel [m], 0 for none."""
 
 
 class Renderer:
-    """Renders worlds in batches; keeps the lit stage of each camera.
+    """Renders worlds in batches; caches the lit stage of each camera.
 
     Args:
         device: Warp's name of a device, None for Warp's default.
-        frames_per_chunk: frames in flight, None for a default by kind of device. It bounds the memory and changes
-            nothing else.
+        frames_per_chunk: frames in flight, None for a default by kind of device; bounds the memory.
     """
 
     def __init__(self, device: str | None = None, frames_per_chunk: int | None = None) -> None:
@@ -95,12 +89,7 @@ class Renderer:
         body: bool = False,
         optical_flow: bool = False,
     ) -> Frames:
-        """Render one world, a batch of one; arguments as of `World` and `render_batch`.
-
-        Args:
-            pose: [t b 7] xyz [m] and quaternion xyzw of each body, world.
-            points: [t k 3] points to look up [m], world.
-        """
+        """Render one world; `pose` [t b 7] and `points` [t k 3] as of `World`, other arguments as of `render_batch`."""
         worlds = [World(bodies, pose, points)]
         return self.render_batch(worlds, camera, ground, depth=depth, body=body, optical_flow=optical_flow)[0]
 
@@ -118,7 +107,7 @@ class Renderer:
 
         Args:
             ground: True for table, wall, ground and shadows; False for the bodies alone on white, without shadows.
-            depth, body, optical_flow: which of the optional images of `Frames` to make.
+            depth, body, optical_flow: requests for the optional images of `Frames`.
 
         Raises:
             ValueError: poses or points do not fit, or are not finite.
@@ -129,15 +118,11 @@ class Renderer:
             return []
         optional = {"depth": depth, "body": body, "optical_flow": optical_flow}
         wanted = frozenset(name for name, asked_for in optional.items() if asked_for)
-        with PARSING:  # threads take turns at the device, whose buffers and modules are shared; the latter are parsed
+        with PARSING:  # threads share the device's buffers and modules
             return _split_by_world(self._render_worlds(worlds, camera, ground, wanted), worlds)
 
     def probe_batch(self, worlds: Sequence[World], camera: Camera = HEAD_CAMERA) -> list[Frames]:
-        """Look up the points of worlds with the stage about them, and which body each pixel shows and how far off, without any
-        colors.
-
-        Returns:
-            For each world its frames as `render_batch` gives them, of which `rgb` and `optical_flow` are empty.
+        """As `render_batch` with stage, bodies and depth, but without `rgb`, for worlds with points.
 
         Raises:
             ValueError: poses or points do not fit, or are not finite, or a world has no points.
@@ -177,10 +162,7 @@ class Renderer:
         return host
 
     def _fetch(self, image: wp.array, host: dict[str, np.ndarray], name: str, chunk: slice, count: int) -> None:
-        """Copy a chunk's image to its place among all frames of a call.
-
-        From a GPU by way of memory that the driver has pinned: that is forty times as fast as without.
-        """
+        """Copy a chunk's image to its place among all frames; from a GPU by pinned memory, which is forty times as fast."""
         view = image
         if self.device.is_cuda:
             size = image.size * wp.types.type_size_in_bytes(image.dtype)
@@ -205,7 +187,7 @@ class Renderer:
         return images
 
     def _stage(self, camera: Camera, ground: bool) -> shading.LitStage:
-        """The lit stage of a camera, made at first use. Without a ground one entry serves all cameras of a size."""
+        """The lit stage of a camera, cached; without a ground one entry serves all cameras of a size."""
         view = camera.intrinsics.tobytes() + camera.extrinsics.tobytes() if ground else b""
         key = (view, camera.width, camera.height)
         if key not in self._stages:

@@ -1,8 +1,8 @@
-"""Warp kernels that make colors, masks, depth and optical flow of what each sample shows (raster_kernels.py).
+"""Warp kernels that make colors, masks, depth and optical flow from the samples of raster_kernels.py.
 
-A pixel's color is made once per triangle that it shows, at the mean of that triangle's samples, in linear light. The
-light on what never moves is kept per camera and source; a frame only multiplies it with its shadows. Frames of reference
-and letters of shapes are those of raster_kernels.py; k counts points to look up in a frame.
+A pixel is shaded once per visible triangle, at the mean of that triangle's samples, in linear light. The light on the stage is
+cached per camera and source; a frame multiplies it with its shadows. Frames of reference and letters of shapes are as in
+raster_kernels.py; k counts points to look up in a frame.
 """
 
 # Warp does not know any().
@@ -51,7 +51,7 @@ class Shading:
 
 @wp.struct
 class LitStage:
-    """The stage (what never moves) as one camera sees it: keys of its samples and, per pixel, its light without shadows."""
+    """The static stage in one camera's view: keys of its samples and, per pixel, its light without shadows."""
 
     key: wp.array3d(dtype=wp.uint64)  # [s h w] uint64
     ambient: wp.array2d(dtype=wp.vec3)  # [h w 3] float32 linear RGB
@@ -184,12 +184,12 @@ def direct_light(surface: Surface, light: Light, shading: Shading) -> wp.vec3:
 
 @wp.func
 def compress_highlight(light: float, shading: Shading) -> float:
-    """Bend bright light towards a ceiling below white, so that a lit white robot keeps its shape on a white ground."""
+    """Compress bright light below a ceiling, for contrast between a white robot and a white ground."""
     above = light - shading.knee
     if above <= 0.0:
         return light
-    room = shading.ceiling - shading.knee
-    return shading.knee + room * (above / (above + room))
+    headroom = shading.ceiling - shading.knee
+    return shading.knee + headroom * (above / (above + headroom))
 
 
 @wp.func
@@ -237,7 +237,7 @@ def light_stage(
     direct_out: wp.array3d(dtype=wp.vec3),  # [l h w 3] float32 linear RGB, without shadows
     shadow_texel_out: wp.array3d(dtype=wp.vec3),  # [l h w 3] float32 x y [texels] and nearness on each shadow map
 ):
-    """Light the stage, once per camera and by source, so that a frame only has to multiply with its shadows."""
+    """Light the stage once per camera, by source; frames multiply it with their shadows."""
     row, column = wp.tid()
     ambient = wp.vec3(0.0, 0.0, 0.0)
     for sample in range(SAMPLES):
@@ -382,7 +382,7 @@ def shade_pixels(
 
 @wp.func
 def carry_point(from_pose: wp.transform, to_pose: wp.transform, point: wp.vec3) -> wp.vec3:
-    """The place [m] to which a point of a body goes when the body goes from one pose to another; all in the world."""
+    """A point [m] of a body after the body moves from one pose to another; all in the world."""
     return wp.transform_point(to_pose, wp.transform_point(wp.transform_inverse(from_pose), point))
 
 
@@ -416,7 +416,7 @@ def measure_pixels(
     depth_out: wp.array3d(dtype=float),  # [n h w] float32 m, 0 where nothing is; or [0 0 0]
     flow_out: wp.array3d(dtype=wp.vec2),  # [n h w 2] float32 pixels to the next frame, x right, y down; or [0 0 0 2]
 ):
-    """Measure what is at each pixel's center; outputs without elements are left out."""
+    """Measure the surface at each pixel's center; empty outputs are skipped."""
     frame, row, column = wp.tid()
     world = frame_world[frame]
     body = -1

@@ -1,7 +1,5 @@
-"""Images that follow from a robot and its commands alone: what a model may know in advance.
+"""Images from a robot and its canonical commands [t 16] alone, without recorded states: a model may know them in advance.
 
-Reads  a robot and canonical commands [t 16]; never a recorded state, so that no condition sees the future
-Writes the robot-only render with mask and exact optical flow, ray map, and task-independent views of the robot
 To add one, write a pure function of (robot, action, camera) here.
 """
 
@@ -28,11 +26,11 @@ CLIP_FRAMES = 17
 VIEW_ELEVATION = 25.0
 """Height of the cameras of reference views over the horizon [deg]."""
 FIT_MARGIN = 1.05
-"""Room round the robot in reference views, as a factor of the distance."""
+"""Margin round the robot in reference views, as a factor of the distance."""
 SWEEP = 0.6
 """Angle by which the articulation clip moves a joint from home to either side, where its limits allow [rad]."""
 STILL = 0.5
-"""Length below which optical flow is drawn as none [pixels]."""
+"""Length below which optical flow is drawn as zero [pixels]."""
 AXIS_LENGTH = 0.1
 """Length of the tool's axes in the ray map [m]."""
 MARKER_RADIUS, AXIS_WIDTH = 50 / 512, 8 / 512
@@ -56,11 +54,8 @@ class CommandStreams:
 
 
 def default_renderer() -> Renderer:
-    """The process's renderer on Warp's default device, made at first use: its kernels and lit stages are shared.
-
-    Threads wait for the one that makes it: Warp hands out a device before its streams are there, and `cache` has no lock.
-    """
-    with PARSING:
+    """The process's shared renderer on Warp's default device, created at first use."""
+    with PARSING:  # Warp's devices and `cache` are not thread-safe at first use
         return _make_default_renderer()
 
 
@@ -99,22 +94,18 @@ def _worlds(commands: Sequence[tuple[RobotSpec, np.ndarray]]) -> list[World]:
 
 
 def flow_to_rgb(flow: np.ndarray, clip: float = FLOW_LIMIT) -> np.ndarray:
-    """Optical flow as a video that an image codec can take: direction is hue, length is saturation, rest is white.
+    """Optical flow as a video [t h w 3] uint8: direction is hue, length is saturation, rest is white.
 
-    The color wheel is FlowWAM's. Frame 0 is white and frame k holds the motion from k - 1 to k, so that the video has
-    as many frames as the RGB beside it.
+    The color wheel is FlowWAM's. Frame 0 is white and frame k holds the motion from k - 1 to k.
 
     Args:
         flow: [t h w 2] float32 motion from each frame to the next [pixels].
         clip: length of full saturation [pixels]; the paper's 25, FlowWAM's WorldArena script has 20.
-
-    Returns:
-        [t h w 3] uint8.
     """
     wheel = color_wheel()
     video = np.full((*flow.shape[:3], 3), 255, np.uint8)
     x, y = flow[:-1, ..., 0], flow[:-1, ..., 1]
-    moving = x * x + y * y >= STILL * STILL  # little of a picture moves
+    moving = x * x + y * y >= STILL * STILL  # few pixels move
     x, y = x[moving], y[moving]
     hue = (np.arctan2(y, x) + np.pi) / (2 * np.pi) * 179
     saturation = np.minimum(np.sqrt(x * x + y * y) / clip, 1) * 255
@@ -132,10 +123,9 @@ def color_wheel() -> np.ndarray:
 def ray_map(robot: RobotSpec, action: np.ndarray, camera: Camera = HEAD_CAMERA) -> np.ndarray:
     """The tool frames of canonical commands [t 16] drawn into the image: [t h w 3] uint8.
 
-    On gray, each tool has a base marker, a disc at the origin of its frame whose color goes with the gripper, and over it
-    its x (approach), y (along which the fingers open) and z axes in red, green and blue, 0.1 m long, in the proportions of
-    EnerVerse-AC's trajectory maps. A tool that is nearer covers one that is farther; a tool that is not in front of the
-    camera is left out.
+    On gray, each tool has a disc at its origin, whose color shows the gripper, and its x (approach), y (opening) and z axes in
+    red, green and blue, 0.1 m long, in the proportions of EnerVerse-AC's trajectory maps. The nearer tool covers the other;
+    tools behind the camera are omitted.
     """
     action = _check_action(action)
     canvas = np.full((len(action), camera.height, camera.width, 3), RAY_MAP_GROUND, np.uint8)
@@ -182,16 +172,17 @@ def nine_views(robot: RobotSpec) -> np.ndarray:
 
 
 def articulation_clip(robot: RobotSpec) -> np.ndarray:
-    """A clip of the robot, seen from the front, that sweeps every joint and both grippers (`articulation_action`): [17 h w 3]
-    uint8."""
+    """A clip [17 h w 3] uint8 of the robot, from the front, that sweeps every joint and both grippers."""
     bodies, pose = robot_bodies(robot), robot_pose(robot, articulation_action(robot))
     camera = fit_cameras(bodies, pose, [0.0])[0]
     return default_renderer().render(bodies, pose, camera, ground=False).rgb
 
 
 def articulation_action(robot: RobotSpec) -> np.ndarray:
-    """[17 16] float64 commands that move all joints to both sides of home, within the limits of experts, close and open the
-    grippers and end where they began. The outer three joints swing twice while the others swing once."""
+    """[17 16] float64 commands that move all joints to both sides of home within the experts' limits, and both grippers.
+
+    They end at home. The outer three joints swing twice while the others swing once.
+    """
     home = home_action(robot)
     swing = 2 * np.pi * np.arange(CLIP_FRAMES) / (CLIP_FRAMES - 1)
     action = np.tile(home, (CLIP_FRAMES, 1))
@@ -215,9 +206,9 @@ def home_action(robot: RobotSpec) -> np.ndarray:
 
 
 def fit_cameras(bodies: Sequence[Body], pose: np.ndarray, azimuths: Sequence[float]) -> list[Camera]:
-    """Cameras round the robot, equally far from its middle, so near that poses [t b 7] just fit into every image.
+    """Cameras round the robot at the least equal distance at which poses [t b 7] fit into every image.
 
-    Azimuth 0 [deg] looks the robot in the face; from there it goes round towards the robot's left hand.
+    Azimuth 0 [deg] is in front of the robot; it increases towards the robot's left hand.
     """
     placed = [
         np.einsum("tij,vj->tvi", frame[:, :3, :3], body.mesh.vertices) + frame[:, None, :3, 3]

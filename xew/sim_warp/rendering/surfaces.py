@@ -1,16 +1,12 @@
-"""Points on surfaces: where they are in the image, and whether the camera sees them, as recorded states have it.
+"""Surface tracks: pixels and visibility of points on the robot's moving links, on objects and on hinged lids.
 
-Reads  `Recording`s: a robot, its measured joints, and things with their measured poses
-Writes `SurfaceTracks`: pixels and visibility of points on the robot's moving links, on objects and on hinged lids
-
-A point is fixed to its body, so that its path follows from the states. It is seen where the renderer's own buffer shows its
-body at its pixel, at its depth: what hides it may be the robot, an object, the table, or its own body. Of many points sampled
-on each body, few are kept: as many as it takes to see some of them in every frame in which the body is seen. Where that leaves
-too few in some frames, as on a lid seen edge-on or a tool in a hand, far more are sampled, and a few of these fill the frames.
+A point is fixed to its body. It is visible if the renderer's buffer shows its body at its pixel and depth. Among many sampled
+points of a body, few are selected: enough to see some in every frame in which the body is visible. For frames with too few, for
+example of a lid seen edge-on, more points are sampled and a few of them added.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -20,55 +16,52 @@ from xew.sim_warp.embodiment.urdf import load_urdf
 from xew.sim_warp.geometry.camera import HEAD_CAMERA, Camera, project
 from xew.sim_warp.geometry.poses import matrix_from_pose
 from xew.sim_warp.geometry.surface_points import sample_surface
-from xew.sim_warp.rendering.bodies import SIDES, body_names, robot_bodies, robot_pose
-from xew.sim_warp.rendering.observe import Recording
-from xew.sim_warp.rendering.render import Frames, Renderer, World, nearest_pixel
+from xew.sim_warp.rendering.bodies import SIDES, body_names, robot_bodies
+from xew.sim_warp.rendering.observe import Recording, recording_world
+from xew.sim_warp.rendering.render import Frames, Renderer, nearest_pixel
 
 LINK_CANDIDATES, THING_CANDIDATES = 64, 256
-"""Numbers of points that are sampled on each link that an arm or a gripper moves, and on each object and hinged lid: of what a
-hand holds only a rim may be seen, and parts of a mesh lie inside others."""
+"""Numbers of sampled points on each moving link, and on each object and hinged lid."""
 WANTED_OF_LINK, WANTED_OF_THING = 3, 8
-"""Numbers of visible points of each that are kept for every frame, as far as so many of the candidates are seen in it."""
+"""Numbers of visible points per frame on each, if there are as many candidates."""
 DEPTH_MARGIN = 0.01
-"""Largest distance in depth [m] between a point and what its pixel shows of its own body at the pixel's center."""
+"""Largest difference [m] between a point's depth and its body's depth at the pixel's center."""
 LEAST_FACING = 0.15
-"""Least cosine between a point's normal and the direction to the camera; what is seen at a flatter angle is a rim."""
+"""Least cosine between a point's normal and the direction to the camera."""
 AIM_OF_ROBOT, AIM_OF_THING = 8, 4
-"""Numbers of visible points that a frame should have of the whole robot, and of a thing that is moving. Frames that have fewer
-are filled with points of a denser set."""
+"""Target numbers of visible points per frame of the whole robot, and of a moving object; denser sets fill other frames."""
 LEAST_SHOWN = 16
-"""Least number of pixels that show what is filled, a square of four: of a smaller one most that lies round a point is something
-else."""
+"""Least number of pixels of a body that is filled; of smaller ones, other surfaces surround a point."""
 DENSE_LINK_CANDIDATES, DENSE_THING_CANDIDATES = 256, 1024
-"""Numbers of points of the denser sets on each moving link and on each thing."""
+"""Numbers of points of the denser sets on each moving link and on each object."""
 LEAST_DENSE_FACING = 0.0
-"""Least cosine of a point of the denser sets: of a lid that is seen edge-on what is flat to the view is all there is."""
+"""Least cosine for points of the denser sets, for lids seen edge-on."""
 MOVED = 0.01
-"""Distance from its first place [m] from which on a body has moved."""
+"""Least displacement of a moved body since the first frame [m]."""
 MOVING = 0.001
-"""Distance from one frame to the next [m] from which on a body is moving."""
+"""Least displacement of a moving body between frames [m]."""
 
 
 @dataclass(frozen=True)
 class SurfaceTracks:
-    """Points on the surfaces of an episode: p points on b bodies that can move."""
+    """Surface points of an episode: p points on b movable bodies."""
 
     pixels: np.ndarray
     """[t p 2] float32 x right, y down; NaN behind the camera."""
     visible: np.ndarray
     """[t p] bool."""
     body: np.ndarray
-    """[p] int32, index of the body that a point lies on."""
+    """[p] int32, index of a point's body."""
     shown: np.ndarray
-    """[t h w] int16, index of the body that a pixel shows, -1 for any other."""
+    """[t h w] int16, index of a pixel's body, -1 for any other."""
     names: tuple[str, ...]
-    """Names of the b bodies: side and link of a robot, name of an object, and name and lid of what has a hinge."""
+    """Names of the b bodies: side and link of the robot, names of objects and of their lids."""
     is_robot: np.ndarray
     """[b] bool."""
     displacement: np.ndarray
-    """[t b] float32, the farthest that any of a body's points is from where it was in the first frame [m]."""
+    """[t b] float32, largest displacement of a body's points since the first frame [m]."""
     step: np.ndarray
-    """[t b] float32, the farthest that any of a body's points has moved since the frame before [m], 0 in the first."""
+    """[t b] float32, largest displacement of a body's points since the previous frame [m], 0 in the first."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +76,7 @@ class _Points:
 
 @dataclass(frozen=True)
 class _Placed:
-    """Points of several bodies, where they are in the world."""
+    """Points of several bodies in the world."""
 
     xyz: np.ndarray
     """[t p 3] m."""
@@ -95,7 +88,7 @@ class _Placed:
 
 @dataclass(frozen=True)
 class _View:
-    """An episode of t frames and what the camera sees of it."""
+    """An episode of t frames and its images."""
 
     recording: Recording
     pose: np.ndarray
@@ -106,7 +99,7 @@ class _View:
 
 @dataclass(frozen=True)
 class _Seen:
-    """Points of several bodies, as the camera sees them."""
+    """Points of several bodies in the image."""
 
     pixels: np.ndarray
     """[t p 2] float64 x right, y down; NaN behind the camera."""
@@ -116,42 +109,26 @@ class _Seen:
     """[p] int, index of each point's body in its world."""
 
     def select(self, points: np.ndarray) -> "_Seen":
-        """Those of an index [k]."""
+        """The points of an index [k]."""
         return _Seen(self.pixels[:, points], self.visible[:, points], self.body[points])
 
 
 def track_surfaces(
     recordings: Sequence[Recording], thing_names: Sequence[Sequence[str]], renderer: Renderer, camera: Camera = HEAD_CAMERA
 ) -> list[SurfaceTracks]:
-    """Follow the points of many episodes at once; the result of each does not depend on the others.
-
-    Args:
-        recordings: what the camera looks at.
-        thing_names: for each, the names of its things, in order.
-        renderer: whose buffer says what is seen.
-        camera: the camera.
-    """
-    poses = [_body_pose(recording) for recording in recordings]
-    placed = [_place(_candidates(recording), pose) for recording, pose in zip(recordings, poses, strict=True)]
-    worlds = [
-        World([*robot_bodies(recording.robot), *recording.things], pose, points.xyz)
-        for recording, pose, points in zip(recordings, poses, placed, strict=True)
-    ]
+    """Tracks of many episodes at once, with the names of each recording's things; results do not depend on the batch."""
+    worlds = [recording_world(recording) for recording in recordings]
+    placed = [_place(_candidates(recording), world.pose) for recording, world in zip(recordings, worlds, strict=True)]
+    worlds = [replace(world, points=points.xyz) for world, points in zip(worlds, placed, strict=True)]
     seen = renderer.probe_batch(worlds, camera)
     return [
-        _tracks(_View(recording, pose, shown, camera), names, points)
-        for recording, names, pose, points, shown in zip(recordings, thing_names, poses, placed, seen, strict=True)
+        _tracks(_View(recording, world.pose, shown, camera), names, points)
+        for recording, names, world, points, shown in zip(recordings, thing_names, worlds, placed, seen, strict=True)
     ]
-
-
-def _body_pose(recording: Recording) -> np.ndarray:
-    """Poses [t b 7] of all bodies of a recording, the robot's first."""
-    pose = robot_pose(recording.robot, recording.joint_pos)
-    return pose if recording.thing_pose is None else np.concatenate([pose, recording.thing_pose], 1)
 
 
 def _candidates(recording: Recording) -> dict[int, _Points]:
-    """The points of each body that has some, of which the tracks' are chosen."""
+    """The candidate points of each body."""
     things = [_Points(*sample_surface(thing.mesh, THING_CANDIDATES)) for thing in recording.things]
     return dict(enumerate([*robot_points(recording.robot), *things]))
 
@@ -167,31 +144,31 @@ def _place(points: Mapping[int, _Points], pose: np.ndarray) -> _Placed:
 
 @lru_cache(maxsize=32)
 def robot_points(robot: RobotSpec, count: int = LINK_CANDIDATES) -> tuple[_Points, ...]:
-    """Points of each of the robot's visible links, in the order of `robot_bodies`; none on links that nothing moves."""
+    """Points of each of the robot's visible links, in the order of `robot_bodies`; none on fixed links."""
     urdf = load_urdf(robot.urdf)
     moving = {name for arm in robot.arms for name in (*arm.joints, *arm.fingers)}
-    found = []
+    points = []
     for body, (_, link) in zip(robot_bodies(robot), body_names(robot), strict=True):
         moves = any(joint.name in moving for joint in urdf.chain(link))
-        found.append(_Points(*sample_surface(body.mesh, count if moves else 0)))
-    return tuple(found)
+        points.append(_Points(*sample_surface(body.mesh, count if moves else 0)))
+    return tuple(points)
 
 
 def _tracks(view: _View, thing_names: Sequence[str], placed: _Placed) -> SurfaceTracks:
-    """Tracks from the candidates, which the view's frames were probed with."""
+    """Tracks from the candidates, with which the view's frames were probed."""
     seen = _see(view.camera, placed, view.shown.point_body, view.shown.point_depth, LEAST_FACING)
     links = _link_names(view.recording.robot)
     bodies = np.unique(placed.body)
     wanted = {b: WANTED_OF_LINK if b < len(links) else WANTED_OF_THING for b in bodies}
-    kept = [np.flatnonzero(seen.body == b)[choose_points(seen.visible[:, seen.body == b], wanted[b])] for b in bodies]
+    chosen = [np.flatnonzero(seen.body == b)[choose_points(seen.visible[:, seen.body == b], wanted[b])] for b in bodies]
     far = [_motion(placed.xyz[:, placed.body == b]) for b in bodies]
-    first = seen.select(np.concatenate(kept))
+    first = seen.select(np.concatenate(chosen))
     parts = [first, _fill(view, bodies[bodies < len(links)].tolist(), AIM_OF_ROBOT, first)]
     for b, (displacement, step) in zip(bodies, far, strict=True):
         if b >= len(links) and displacement.max() > MOVED:
             parts.append(_fill(view, [b], np.where(step > MOVING, AIM_OF_THING, 0), first))
     points = _join(parts)
-    number = np.full(len(links) + len(thing_names) + 1, -1, np.int16)  # the last is that of body -1
+    number = np.full(len(links) + len(thing_names) + 1, -1, np.int16)  # the last entry is for body -1
     number[bodies] = np.arange(len(bodies))
     return SurfaceTracks(
         pixels=points.pixels.astype(np.float32),
@@ -206,7 +183,7 @@ def _tracks(view: _View, thing_names: Sequence[str], placed: _Placed) -> Surface
 
 
 def _see(camera: Camera, placed: _Placed, body: np.ndarray, depth: np.ndarray, least_facing: float) -> _Seen:
-    """Points that face the camera, by a least cosine, are seen where the buffer has their body [t p] at their depth [t p] m."""
+    """Points in the image; visible are those that face the camera where the buffer has their body and depth, both [t p]."""
     pixels, own_depth = project(camera, placed.xyz)
     to_camera = camera.position - placed.xyz
     facing = np.einsum("tpi,tpi->tp", placed.normal, to_camera) > least_facing * np.linalg.norm(to_camera, axis=-1)
@@ -221,30 +198,23 @@ def _join(parts: Sequence[_Seen]) -> _Seen:
 
 
 def _fill(view: _View, bodies: Sequence[int], aim: int | np.ndarray, first: _Seen) -> _Seen:
-    """Few points of the denser sets on some bodies, for frames in which the first points are fewer than is aimed at.
+    """Few points of the denser sets to add on some bodies, for frames with fewer visible points than `aim`, one or [t].
 
-    Args:
-        view: the episode.
-        bodies: what the aim is of: the robot's links together, or one thing.
-        aim: how many points should be visible in a frame, or [t] in each; all that are, where they are fewer.
-        first: the points that there are.
-
-    Returns:
-        The points to add; none where the first suffice, or nothing is seen.
+    `bodies` are the robot's links together, or one object; `first` are the points so far.
     """
     missing = np.maximum(aim - np.sum(first.visible[:, np.isin(first.body, bodies)], axis=1), 0)
     lacking = np.flatnonzero(missing)
     pixels = np.stack([np.sum(view.shown.body[lacking] == body, axis=(1, 2)) for body in bodies])
     missing[lacking[pixels.sum(axis=0) < LEAST_SHOWN]] = 0
-    found = [_look(view, body) for body, of_body in zip(bodies, pixels, strict=True) if of_body[missing[lacking] > 0].any()]
-    if not found:
+    sets = [_look(view, body) for body, of_body in zip(bodies, pixels, strict=True) if of_body[missing[lacking] > 0].any()]
+    if not sets:
         return first.select(np.zeros(0, int))
-    dense = _join(found)
+    dense = _join(sets)
     return dense.select(choose_points(dense.visible, missing))
 
 
 def _look(view: _View, body: int) -> _Seen:
-    """The denser set on one body, looked up in the view's frames."""
+    """The denser set on one body in the view's frames."""
     links = robot_bodies(view.recording.robot)
     if body < len(links):
         points = robot_points(view.recording.robot, DENSE_LINK_CANDIDATES)[body]
@@ -259,14 +229,11 @@ def _look(view: _View, body: int) -> _Seen:
 
 
 def choose_points(visible: np.ndarray, wanted: int | np.ndarray) -> np.ndarray:
-    """Indices of few points of which enough are seen in every frame, by greedy set cover; the earlier of equals.
+    """Ascending indices [k] int of few points, enough visible in every frame, by greedy set cover; of equals the earlier.
 
     Args:
-        visible: [t n] bool, in which frames each of the points is seen.
-        wanted: how many should be seen in a frame, or [t] in each; all that are, where they are fewer.
-
-    Returns:
-        [k] int, ascending.
+        visible: [t n] bool, visibility of each point by frame.
+        wanted: number of visible points for every frame, or [t] for each; all visible points if there are fewer.
     """
     missing = np.minimum(visible.sum(axis=1), wanted)
     left = visible.copy()
@@ -287,6 +254,6 @@ def _motion(world: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _link_names(robot: RobotSpec) -> list[str]:
-    """Names of the robot's bodies; of a URDF that stands for both arms, with the side."""
+    """Names of the robot's bodies, with the side if each arm has a copy of the URDF."""
     names = body_names(robot)
     return [link if robot.one_urdf_holds_both_arms else f"{SIDES[copy]}/{link}" for copy, link in names]

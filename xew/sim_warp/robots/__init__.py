@@ -1,9 +1,8 @@
-"""Registry of robots: five bimanual ones, each a URDF with our own geometry and one `RobotSpec`; and bodies by number.
+"""Registry of robots: five bimanual robots, each a URDF with a `RobotSpec`, and procedural bodies by number.
 
-`body:17` names a procedural body, `body:0-63` a range of them (docs/bodies.md); their keys are `body_17`. To add a robot, write
-a file with `SPEC = RobotSpec(...)` here and add its line to `ROBOTS`; outside the repository write it anywhere importable and
-name it `module:SPEC` wherever a robot is asked for, or name the path of a URDF or of a RoboTwin embodiment
-(docs/add_a_robot.md).
+`body:17` names a procedural body, `body:0-63` a range (docs/bodies.md); keys are `body_17`. To add a robot, write a file with
+`SPEC = RobotSpec(...)` here and add a line to `ROBOTS`. Outside the repository, use `module:SPEC`, or the path of a URDF or
+RoboTwin embodiment (docs/add_a_robot.md).
 """
 
 from pathlib import Path
@@ -41,11 +40,11 @@ ROBOTS: dict[str, RobotSpec] = {
 
 
 def get_robot(name: str | RobotSpec, data: Path | None = None) -> RobotSpec:
-    """The robot of a registry key, of an import path `module:NAME`, at a path, kept beside data, or a body by its number.
+    """The robot of a registry key, `module:NAME` or path, of a data set, or a body by its number.
 
     Args:
-        name: of the robot; a robot itself is returned as it is.
-        data: data set whose own robots are looked through, before those in the folders of `XEW_ROBOTS`.
+        name: name of the robot, or the robot itself.
+        data: data set whose robots are searched, before the folders of `XEW_ROBOTS`.
 
     Raises:
         ConfigError: there is no such robot, or it cannot be used.
@@ -63,16 +62,12 @@ def get_robot(name: str | RobotSpec, data: Path | None = None) -> RobotSpec:
             return robot
         if ":" in name:
             raise
-        hint = f"A robot at a path is named with a /; a data set keeps its own in <data>/robots, list that in {FOLDERS}."
+        hint = f"A path needs a /. For robots of a data set, list <data>/robots in {FOLDERS}."
         raise ConfigError(f"{error} {hint}") from None
 
 
 def recorded_robot(name: str, data: Path | None = None) -> RobotSpec:
-    """The robot that an episode or another file names: it is never a path, and `module:NAME` only of an admitted module.
-
-    Args:
-        name: as recorded.
-        data: as in `get_robot`; what a robot there is read from lies below its folder.
+    """The robot that an episode or another file names: never a path, and `module:NAME` only of an admitted module.
 
     Raises:
         UntrustedError: its module is not admitted.
@@ -84,5 +79,5 @@ def recorded_robot(name: str, data: Path | None = None) -> RobotSpec:
         raise ConfigError(str(error)) from error
     demand_admitted(name, "the robot")
     if name not in ROBOTS and is_path(name):  # as arm.urdf, a file of the current folder
-        raise ConfigError(f"the robot is {name!r}, a path; rename the folder that keeps it, and what names it.")
+        raise ConfigError(f"the robot is {name!r}, a path; rename its folder and correct the files that name it.")
     return get_robot(name, data)

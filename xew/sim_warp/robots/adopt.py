@@ -5,10 +5,10 @@
     python -m xew.sim_warp.robots.adopt lab/ur5e.urdf --hand ur5_wsg
 
 Writes <out>/<key>/ with the URDF, all files that it names and a robot.yaml that marks each entry as given or found, and
-<out>/<key>.png, nine views. Prints a summary of the robot and what looks wrong.
+<out>/<key>.png, nine views. Prints a summary of the robot and warnings.
 
-Only this command expands xacro, finds meshes of packages in other folders, converts linked fingers to sliding ones, puts one of
-the project's hands on a bare arm, and gives mirrored arms the same limits.
+Only this command expands xacro, finds meshes of packages in other folders, converts linked fingers to sliding ones, mounts one
+of xew's hands on a bare arm, and gives mirrored arms the same limits.
 """
 
 import tempfile
@@ -44,28 +44,28 @@ STAGES = ("files", "hands", "place", "plans", "reach", "pictures")
 
 @dataclass(frozen=True)
 class Args:
-    """Complete a robot's description once, into a folder that every other command takes."""
+    """Complete a robot's description once, as a folder for every other command."""
 
     robot: Annotated[Path, tyro.conf.Positional]
     """A .urdf, .xacro, or a folder with a robot.yaml, a RoboTwin config.yml or one URDF."""
     out: Path = Path("robots")
-    """Folder for the robot's folder."""
+    """Parent of the robot's folder."""
     package: tuple[str, ...] = ()
-    """NAME=DIR, folders of packages that package:// or a xacro names."""
+    """NAME=DIR, folders of the packages in package:// names or a xacro."""
     argument: tuple[str, ...] = ()
     """NAME=VALUE, arguments of a xacro."""
     hand: str | None = None
-    """Robot of the project whose hand replaces everything that moves beyond the arm's last joint: ur5_wsg, franka_panda."""
+    """Robot of xew whose hand replaces all moving links beyond the arm's last joint: ur5_wsg, franka_panda."""
     last_joint: str | None = None
-    """Name of the arm's last joint, for --hand; default: the last before one that carries two joints, or of all."""
+    """Name of the arm's last joint, for --hand; default: the joint before the first branch."""
 
 
 def adopt(args: Args) -> Path:
-    """Complete a robot's description; returns the folder that was written.
+    """Complete a robot's description; returns the written folder.
 
     Raises:
-        ConfigError: it cannot be read, or it cannot do what every robot must.
-        EpisodeError: the folder holds something else, or another process writes it.
+        ConfigError: the description cannot be read, or the robot does not meet the requirements of all robots.
+        EpisodeError: the folder holds other files, or another process writes it.
     """
     source = find_description(args.robot).resolve()
     draft = RobotDraft(source.name) if source.suffix in (".urdf", ".xacro") else read_draft(source)
@@ -110,12 +110,12 @@ def view_sheet(views: np.ndarray) -> np.ndarray:
 def _pairs(given: Sequence[str], kind: Callable[[str], Value]) -> dict[str, Value]:
     """Values by name, of texts NAME=VALUE."""
     if wrong := [text for text in given if "=" not in text]:
-        raise ConfigError(f"{wrong[0]!r} is no NAME=VALUE.")
+        raise ConfigError(f"{wrong[0]!r} is not of the form NAME=VALUE; correct the option.")
     return {name: kind(value) for name, _, value in (text.partition("=") for text in given)}
 
 
 def _normalize(tree: ElementTree.Element, draft: RobotDraft, args: Args, work: Path, source: str) -> tuple[Urdf, list[str]]:
-    """The robot's URDF with two sliding fingers a hand and equal limits of both arms, and what was changed for that."""
+    """The robot's URDF with two sliding fingers per hand and equal limits of both arms, and notes on the changes."""
     urdf, notes = _load(tree, work), []
     if args.hand is not None:
         if args.hand not in ROBOTS:
@@ -129,13 +129,13 @@ def _normalize(tree: ElementTree.Element, draft: RobotDraft, args: Args, work: P
     if left.joints != right.joints and len(left.joints) == len(right.joints):
         turned = unfold_mirrored(tree, list(zip(left.joints, right.joints, strict=True)), urdf)
         if turned:
-            notes.append(f"the axes of {', '.join(turned)} are turned about, for their limits mirror those of the left arm")
+            notes.append(f"the axes of {', '.join(turned)} are reversed, because their limits mirror the left arm's")
             urdf = _load(tree, work)
     return urdf, notes
 
 
 def _load(tree: ElementTree.Element, work: Path) -> Urdf:
-    """The tree as a URDF, from a file of its own: a URDF is read once a file."""
+    """The tree as a URDF, read from a new file: `load_urdf` caches by file."""
     path = work / f"{len(list(work.iterdir()))}.urdf"
     ElementTree.ElementTree(tree).write(path, encoding="utf-8", xml_declaration=True)
     return load_urdf(path)
@@ -145,7 +145,7 @@ def _load(tree: ElementTree.Element, work: Path) -> Urdf:
 def main() -> None:
     quiet_warp()
     folder = adopt(tyro.cli(Args, description=__doc__))
-    print(f"{folder}: give this path to the other commands; {folder / OWN} says how each entry was found and how to change it")
+    print(f"{folder}: pass this path to the other commands; {folder / OWN} says how each entry was found and how to change it")
 
 
 if __name__ == "__main__":

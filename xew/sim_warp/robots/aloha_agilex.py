@@ -1,6 +1,6 @@
 """ALOHA-AgileX (Cobot Magic): one mobile base, two working arms in front, two teaching arms behind.
 
-Limits that experts keep: real-stanford/arx5-sdk, configuration X5: the front arms are of that family.
+Expert limits: real-stanford/arx5-sdk, configuration X5, the family of the front arms.
 """
 
 from dataclasses import replace

@@ -1,6 +1,6 @@
 """ARX-X5: two black-and-white table-top arms of six joints.
 
-Limits that experts keep: real-stanford/arx5-sdk, configuration X5.
+Expert limits: real-stanford/arx5-sdk, configuration X5.
 """
 
 from dataclasses import replace

@@ -1,6 +1,6 @@
 """Franka Emika Panda with the Franka hand, one at either side.
 
-Limits that experts keep: frankaemika/franka_description robots/fer/joint_limits.yaml.
+Expert limits: frankaemika/franka_description robots/fer/joint_limits.yaml.
 """
 
 from dataclasses import replace

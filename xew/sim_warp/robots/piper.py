@@ -1,7 +1,7 @@
 """AgileX Piper: two dark, light-weight table-top arms of six joints.
 
-Limits that experts keep: agilexrobotics/piper_sdk, and for joint 3 the URDF.
-The arms stand leaning back by 10 degrees, which its short wrist range asks for.
+Expert limits: agilexrobotics/piper_sdk, and for joint 3 the URDF.
+The bases lean back by 10 degrees because of the short wrist range.
 """
 
 from dataclasses import replace

@@ -1,7 +1,7 @@
 """Universal Robots UR5 with a Weiss WSG-50 gripper, one at either side.
 
-Limits that experts keep: the URDF's, inside those of the UR5 manual (ur_description). The gripper could open to 105 mm;
-90 keeps clear of neighboring objects.
+Expert limits: the URDF's, inside the limits of the UR5 manual (ur_description). The gripper opens 90 of 105 mm, for clearance
+from neighboring objects.
 """
 
 from dataclasses import replace

@@ -20,7 +20,7 @@ from xew.sim_warp.tasks.task import STEEP_TILT, Moment, Task, arm_for, pick, pla
 
 COLORS = ("red", "green", "blue")
 GRASP_BELOW_TOP = 0.014
-"""Depth of the tool below the top of a block [m]: small enough that a wide hand passes over the blocks beside."""
+"""Depth of the tool below the top of a block [m]; a wide hand passes over the neighboring blocks."""
 
 
 def sample(rng: np.random.Generator, seed: int) -> Scene:
@@ -47,7 +47,7 @@ def cube(name: str, half: float, color: str, density: float, pose: Pose) -> Scen
 def draw_starts(
     rng: np.random.Generator, accept: Callable[[np.ndarray, list[np.ndarray]], bool], count: int = 3
 ) -> list[np.ndarray]:
-    """Points [2] at which blocks begin, not in order yet; each is accepted with those before it."""
+    """Initial points [2] of blocks that are not in order; `accept` gets each with the points before it."""
     starts: list[np.ndarray] = []
     while not starts or are_in_order(np.array(starts)):
         starts = []
@@ -57,7 +57,7 @@ def draw_starts(
 
 
 def is_free(point: np.ndarray, others: list[np.ndarray]) -> bool:
-    """Can a block begin at `point` [2], clear of the row's middle and of the `others` [2]?"""
+    """Whether `point` [2] is clear of the row's middle and of the `others` [2]."""
     x, y = point
     if abs(x) < 0.05 or (abs(x) < 0.15 and y > 0) or np.hypot(x, y + 0.1) < 0.1:
         return False
@@ -65,7 +65,7 @@ def is_free(point: np.ndarray, others: list[np.ndarray]) -> bool:
 
 
 def are_in_order(positions: np.ndarray) -> bool:
-    """Do blocks at [3 2] stand in a row in their order, each a little to the right of the one before?"""
+    """Whether blocks at [3 2] are in a row in their order, each a little to the right of the one before."""
     step = np.diff(positions, axis=0)
     return bool((step[:, 0] > 0).all() and (step[:, 0] < 0.13).all() and (np.abs(step[:, 1]) < 0.03).all())
 
@@ -78,7 +78,7 @@ def plan(scene: Scene) -> Timeline:
 
 
 def move_block(timeline: Timeline, block: SceneObject, target: Point, *, opening: float = 0.8, release: float = 0.7) -> None:
-    """Put a block down at `target` [2], squarely; `opening` is the gripper's before the grasp, `release` the one after it."""
+    """Put a block down squarely at `target` [2]; `opening` and `release` are gripper values before and after the grasp."""
     arm = arm_for(block.pose[0])
     height = TABLE_TOP + float(block.shape.mesh.vertices[:, 2].max()) - GRASP_BELOW_TOP
     grasp = tool((*block.pose[:2], height), symmetric_yaw(arm, block.pose, block.yaw, np.pi / 2), STEEP_TILT)
@@ -88,7 +88,7 @@ def move_block(timeline: Timeline, block: SceneObject, target: Point, *, opening
 
 
 def success(scene: Scene, now: Moment) -> bool:
-    """Do all objects of the scene, which are the blocks from left to right, stand in order?"""
+    """Whether the scene's objects, the blocks from left to right, are in order."""
     return are_in_order(now.object_pose[:, :2]) and now.both_open
 
 

@@ -44,7 +44,7 @@ def _is_free(point: np.ndarray, others: list[np.ndarray], targets: list[np.ndarr
 
 
 def plan(scene: Scene) -> Timeline:
-    """Small, medium, large: so a hand is always higher than the blocks beside it."""
+    """Small, medium, large: a hand is always higher than the placed blocks."""
     timeline = Timeline()
     for block in reversed(scene.objects):
         width = float(np.ptp(block.shape.mesh.vertices[:, 0]))

@@ -15,7 +15,7 @@ from xew.sim_warp.tasks.task import GRIPPER_CLOSED, Moment, Task, across, pick
 
 GRASP_FROM_END = 0.03
 GRASP_ABOVE_AXIS = 0.006
-"""Height of the tool above the roller's axis [m]; it keeps the lower finger of a leaning hand off the table."""
+"""Height of the tool above the roller's axis [m], for clearance of the lower finger from the table."""
 LIFT = 0.12
 
 

@@ -18,13 +18,13 @@ from xew.sim_warp.tasks.task import GRASP_TILT, Moment, Task, aside_poses, hinge
 BASE_HEIGHT = 0.016
 LID_THICKNESS = 0.009
 RANGE = 3.1
-"""Range of the hinge [rad]: the widest of the original's laptops, so that 20 % of it leaves room for a hand."""
+"""Range of the hinge [rad], the largest of RoboTwin's laptops: 20 % of it is wide enough for a hand."""
 START, GOAL, DONE = 0.2, 0.47, 0.4
-"""Shares of the range at which the lid begins, to which the expert opens it, and from which it counts as open."""
+"""Shares of the range: initial, the expert's goal, and open."""
 FINGER_HALF_WIDTH = 0.011
-"""Half width of every robot's pads along the tool's z [m]: the distance of the pushing face from the tool's axis."""
+"""Half width of every robot's pads along the tool's z [m]."""
 PRESS = 0.004
-"""Distance of the commanded tool beyond touching [m]: the lid's hinge is stiffer than nothing."""
+"""Distance of the commanded tool beyond contact [m], against the hinge's friction."""
 RUN_UP = 0.06
 """Distance before the lid at which the finger comes down [m]."""
 WIDEST_TURN = np.radians(30)
@@ -69,7 +69,7 @@ def lid_edge(scene: Scene, fraction: float) -> np.ndarray:
 
 
 def _pushing_pose(scene: Scene, arm: int, fraction: float, short_by: float) -> Tool:
-    """The closed hand whose far side touches the lid's edge, drawn back toward the laptop's front by `short_by` [m]."""
+    """The closed hand with its far side at the lid's edge, moved back toward the laptop's front by `short_by` [m]."""
     edge, yaw = lid_edge(scene, fraction), scene.object("laptop").yaw
     radial = radial_yaw(arm, edge)
     hand = tool(edge, radial + np.clip(yaw - radial, -WIDEST_TURN, WIDEST_TURN), GRASP_TILT)

@@ -24,17 +24,17 @@ KINDS = (
 LEFT_OF, RIGHT_OF = -1.0, 1.0
 """Sign of x from B to the place for A."""
 BESIDE = 0.13
-"""Distance between the two at which A is put [m]."""
+"""Target distance between A and B [m]."""
 GAP = 0.035
 """Free space between them, for a finger [m]."""
 OVER = 0.08
-"""Height at which A is carried [m]: over all that B may be."""
+"""Height at which A is carried [m], above any B."""
 PALM_HALF_WIDTH = 0.108
-"""Half width of the widest hand, the Panda's, with a little room: it stands over what is lower than it alone [m]."""
+"""Half width of the widest palm, the Panda's, with a margin [m]; B must be lower or farther away."""
 MARGIN = 0.02
-"""Distance by which A is put nearer than what counts [m]."""
+"""Margin of the target distance to FARTHEST [m]."""
 NEAREST, FARTHEST = 0.08, 0.2
-"""Distances between the two that count [m]."""
+"""Range of successful distances between A and B [m]."""
 
 
 def sample_beside(rng: np.random.Generator, task: str, seed: int, side: float) -> Scene:
@@ -43,31 +43,34 @@ def sample_beside(rng: np.random.Generator, task: str, seed: int, side: float) -
     first, second = (household.THINGS[str(kind)](rng) for kind in kinds[:2])
     half = rng.choice([-1.0, 1.0])
     mirror = np.array([half, 1, -side, 1])
-    # B leaves room for A between itself and the end of the arm's reach.
+    # A must fit between B and the end of the arm's reach.
     near, far = (0.18, 0.23) if half == -side else (-0.1, 0.1)
     low, high = [0.02, -0.2, near, -0.2], [0.22, 0.0, far, 0.0]
     positions = draw(rng, low, high, lambda p: _are_apart(p * mirror, first, second, side))
-    at, beside = np.split(positions * mirror, 2)
+    first_xy, second_xy = np.split(positions * mirror, 2)
     return Scene(
         task,
         seed,
-        (first.place_at("a", at, graspable_yaw(rng, at)), second.place_at("b", beside, rng.uniform(-np.pi, np.pi))),
+        (
+            first.place_at("a", first_xy, graspable_yaw(rng, first_xy)),
+            second.place_at("b", second_xy, rng.uniform(-np.pi, np.pi)),
+        ),
         words={"a": first.words, "b": second.words},
     )
 
 
 def _are_apart(positions: np.ndarray, first: Thing, second: Thing, side: float) -> bool:
-    """Are A and B, at [4] x y x y, free of each other, and is A not yet where it is to go?"""
+    """Whether A and B, at [4] x y x y, are apart and A is not at its goal."""
     offset = positions[2:] - positions[:2]
     free = np.hypot(*offset) >= max(0.1, first.radius + second.radius + GAP) and abs(offset[1]) >= 0.1
     return bool(free and (np.hypot(*offset) > FARTHEST - 0.01 or side * offset[0] > 0))
 
 
 def plan_beside(scene: Scene, side: float) -> Timeline:
-    """Put A on the `side` of B, at the yaw that comes easiest."""
+    """Put A on the `side` of B, at any yaw."""
     first, second = scene.object("a"), scene.object("b")
     goal = np.array(second.pose[:3]) + [side * BESIDE, 0, 0]
-    for _ in range(3):  # how far A reaches along x depends on its turn, and the turn on the place
+    for _ in range(3):  # the distance depends on the turn, and the turn on the goal
         goal[0] = second.pose[0] + side * _distance(first, second, first.yaw + easy_turn(first, goal))
     timeline = Timeline()
     carry(timeline, first, goal, easy_turn(first, goal), lift=OVER, above=OVER)
@@ -76,20 +79,20 @@ def plan_beside(scene: Scene, side: float) -> Timeline:
 
 def _distance(first: SceneObject, second: SceneObject, yaw: float) -> float:
     """Distance from B at which A, turned to `yaw` [rad], fingers and palm stay clear of B [m]."""
-    beside = _half_extent(first, yaw) + _half_extent(second, second.yaw) + GAP
+    distance = _half_extent(first, yaw) + _half_extent(second, second.yaw) + GAP
     if second.shape.mesh.vertices[:, 2].max() > grasp_of(first).height + household.PALM:
-        beside = max(beside, PALM_HALF_WIDTH + _half_extent(second, second.yaw))
-    return float(np.clip(beside, BESIDE, FARTHEST - MARGIN))
+        distance = max(distance, PALM_HALF_WIDTH + _half_extent(second, second.yaw))
+    return float(np.clip(distance, BESIDE, FARTHEST - MARGIN))
 
 
 def _half_extent(thing: SceneObject, yaw: float) -> float:
-    """How far a thing turned by `yaw` [rad] reaches from its origin along x [m]."""
+    """Half extent along x of an object turned by `yaw` [rad], from its origin [m]."""
     points = np.concatenate(thing.shape.hulls)
     return float(np.abs(points[:, 0] * np.cos(yaw) - points[:, 1] * np.sin(yaw)).max())
 
 
 def is_beside(scene: Scene, now: Moment, side: float) -> bool:
-    """Is A on the `side` of B, neither too near nor too far, and let go?"""
+    """Whether A is on the `side` of B at a successful distance, with open grippers."""
     first, second = (now.object_pose[scene.index(name), :2] for name in ("a", "b"))
     offset = first - second
     there = side * offset[0] > 0 and abs(offset[1]) < 0.05 and NEAREST < np.hypot(*offset) < FARTHEST

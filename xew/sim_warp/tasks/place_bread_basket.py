@@ -77,7 +77,7 @@ def basket(form: str, color: Color) -> Shape:
 
 
 def _weave(spots: Sequence[tuple[float, float, float]], color: Color) -> Mesh:
-    """Dark and light withies on a wall at (x, y, direction along the wall [rad]), in turn over and under; only seen."""
+    """Alternating dark and light withies on a wall at (x, y, direction along the wall [rad]); decoration."""
     dark, light = objects.darken(color, 0.72), objects.darken(color, 0.94)
     withies = [
         meshes.box((0.0165, 0.0024, 0.008), dark if (number + row) % 2 else light).transformed((x, y, z), (0, 0, angle))
@@ -88,7 +88,7 @@ def _weave(spots: Sequence[tuple[float, float, float]], color: Color) -> Mesh:
 
 
 def _cloth() -> list[Mesh]:
-    """A checked cloth on the floor; it is only seen."""
+    """A checked cloth on the floor; decoration."""
     cloth = meshes.box((0.13, 0.11, 0.001), (244, 240, 230)).transformed((0, 0, FLOOR))
     stripes = [
         meshes.box((0.008, 0.11, 0.0016), (196, 74, 66)).transformed((x, 0, FLOOR)) for x in (-0.045, -0.015, 0.015, 0.045)
@@ -117,7 +117,7 @@ def sample(rng: np.random.Generator, seed: int) -> Scene:
 
 
 def _bread(rng: np.random.Generator) -> Thing:
-    """A bread that is taken high enough for its top not to meet the palm."""
+    """A bread with a grasp high enough for clearance between its top and the palm."""
     bread = household.bread(rng)
     return replace(bread, grasp_height=max(bread.grasp_height, bread.height - PALM))
 
@@ -128,7 +128,7 @@ def _is_free(point: np.ndarray, others: list[np.ndarray]) -> bool:
 
 
 def breads(scene: Scene) -> list[SceneObject]:
-    """The things to put into the basket, the nearer one first."""
+    """The breads, the nearer one first."""
     return [thing for thing in scene.objects if not thing.is_fixed]
 
 
@@ -151,7 +151,7 @@ def plan(scene: Scene) -> Timeline:
 
 
 def _goals(scene: Scene) -> dict[str, Tool]:
-    """The hand as it lets go of each bread: one goes to the middle, two lie side by side."""
+    """Release poses of the hand: one bread in the middle, two side by side."""
     fixed, things = scene.object("basket"), _sort_left_to_right(breads(scene))
     sideways = object_axis(fixed.pose, [1.0, 0, 0])
     goals = {}
@@ -163,7 +163,7 @@ def _goals(scene: Scene) -> dict[str, Tool]:
 
 
 def _sort_left_to_right(things: list[SceneObject]) -> list[SceneObject]:
-    """How breads lie in the basket. Of two on one side the one put down first goes to the far place."""
+    """Breads in the basket from left to right. Of two on one side, the first one goes to the far place."""
     arms = {arm_for(thing.pose[0]) for thing in things}
     if len(arms) == 2:
         return sorted(things, key=lambda thing: thing.pose[0])

@@ -46,7 +46,7 @@ def lying_bottle(task: str, rng: np.random.Generator, seed: int) -> Scene:
 
 
 def front_pose(arm: int) -> Tool:
-    """The pose in which a hand shakes: nearly level, so that what lay under it stands nearly upright."""
+    """The shaking pose of a hand: nearly level, with the bottle nearly upright."""
     x, y, z = FRONT
     return tool((side_sign(arm) * x, y, z), side_sign(arm) * FRONT_YAW, FRONT_TILT)
 

@@ -21,7 +21,7 @@ from xew.sim_warp.stage import TABLE_TOP
 from xew.sim_warp.tasks.task import GRASP_TILT, Moment, Task, arm_for, is_upright, pick, place, radial_turn, radial_yaw
 
 FACETS = 8
-"""Number of flat sides of the knob, so that a pad lies on one."""
+"""Number of flat sides of the knob, for the pads."""
 TURN = 2 * np.pi / FACETS
 GRASP_BELOW_TOP = 0.022
 TARGET = 0.07
@@ -46,7 +46,7 @@ def seal(rng: np.random.Generator, ink: Color) -> Shape:
 
 
 def _prism(radius: float, sides: int, low: float, high: float) -> np.ndarray:
-    """[k 3] corners of an upright prism; `radius` [m] is that of its inscribed circle, a flat side faces +x."""
+    """[k 3] corners of an upright prism; `radius` [m] is the radius of its inscribed circle, a flat side faces +x."""
     return np.concatenate([containers.ring(radius, sides, low), containers.ring(radius, sides, high)]).astype(np.float32)
 
 

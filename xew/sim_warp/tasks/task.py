@@ -1,4 +1,4 @@
-"""Tasks and the moves that they share: a task is a scene to sample, a plan that solves it, and a test of success."""
+"""Tasks and their common moves: a task samples a scene, plans its solution and tests success."""
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
@@ -14,19 +14,19 @@ from xew.sim_warp.stage import TABLE_TOP
 GRASP_TILT = np.radians(30)
 """Lean of the hand in a grasp from above [rad]: all five robots reach the work area with it (docs/robots.md)."""
 STEEP_TILT = np.radians(10)
-"""Lean for grasps low over the near part of the table, where a wrist of small range has it easier [rad]."""
+"""Lean for low grasps over the near part of the table, for wrists of small range [rad]."""
 TURN_TILT = np.radians(20)
-"""Lean for grasps across turned objects: the one with which all robots turn a hand up to `WIDEST_TURN`."""
+"""Lean for grasps across turned objects; all robots turn a hand up to `WIDEST_TURN` with it."""
 WIDEST_TURN = np.radians(55)
 """Largest turn of a hand from its radial yaw, over the near part of the table (y below .02) [rad]."""
 EASY_TURN = np.radians(35)
-"""Turn of a hand from its radial yaw where it need not be more [rad]: reached higher and farther than `WIDEST_TURN`."""
+"""Preferred largest turn of a hand from its radial yaw [rad], with a larger reach than `WIDEST_TURN`."""
 PRE_GRASP = 0.09
-"""Distance before a grasp from which the approach is straight [m]."""
+"""Length of the straight approach before a grasp [m]."""
 HOVER = 0.001
 """Height above its place at which an object is released [m]."""
 LET_GO = 0.016
-"""Distance by which a hand opens wider than the held object, to be clear of it [m]."""
+"""Clearance of an opened hand around the released object [m]."""
 NARROWEST_HAND = 0.08
 """Distance between the open pads of the narrowest gripper [m]."""
 GRIPPER_OPEN = 0.8
@@ -36,7 +36,7 @@ GRIPPER_CLOSED = 0.2
 
 @dataclass(frozen=True)
 class Moment:
-    """One frame of an episode, as success tests see it."""
+    """One frame of an episode for success tests."""
 
     object_pose: np.ndarray
     """[o 7] m and quaternion x y z w, world."""
@@ -47,11 +47,11 @@ class Moment:
     gripper: np.ndarray
     """[2] commanded, 0 closed, 1 open."""
     contact: np.ndarray
-    """[2 o] bool, fingers of each arm against each object."""
+    """[2 o] bool, contacts of each arm's fingers and each object."""
 
     @property
     def both_open(self) -> bool:
-        """Are both grippers open?"""
+        """Whether both grippers are open."""
         return bool((self.gripper > GRIPPER_OPEN).all())
 
 
@@ -63,11 +63,11 @@ class Task:
     instruction: str
     """Sentence in English, with {slots} that the words of the scene fill."""
     sample: Callable[[np.random.Generator, int], Scene]
-    """Function (random stream, seed) -> scene; it knows no robot."""
+    """Function (random stream, seed) -> scene, independent of the robot."""
     plan: Callable[[Scene], Timeline]
-    """Function scene -> waypoints of both tools; it knows no robot."""
+    """Function scene -> waypoints of both tools, independent of the robot."""
     success: Callable[[Scene, Moment], bool]
-    """Function (scene, moment) -> is the task done?"""
+    """Function (scene, moment) -> whether the task is solved."""
 
 
 def point_above(thing: SceneObject, height: float) -> np.ndarray:
@@ -81,7 +81,7 @@ def object_axis(pose: np.ndarray | Pose, axis: Point) -> np.ndarray:
 
 
 def is_upright(pose: np.ndarray, lean: float) -> bool:
-    """Does the z axis of an object at a pose [7] lean by less than `lean` [deg]?"""
+    """Whether the z axis of an object at a pose [7] leans by less than `lean` [deg]."""
     return bool(object_axis(pose, [0, 0, 1])[2] > np.cos(np.radians(lean)))
 
 
@@ -96,10 +96,7 @@ def side_sign(arm: int) -> float:
 
 
 def pick(timeline: Timeline, grasps: dict[int, Tool], lift: float, opening: float = 1.0) -> None:
-    """Approach, grasp and lift with one or both arms; `opening` is the gripper's before the grasp.
-
-    An arm that has no part in it goes aside during the approach.
-    """
+    """Approach, grasp and lift with one or both arms, which open to `opening` before; an idle arm moves aside."""
     if opening < 1.0:
         timeline.grip(dict.fromkeys(grasps, opening), seconds=0.24)
     idle = aside_poses(grasps)
@@ -111,7 +108,7 @@ def pick(timeline: Timeline, grasps: dict[int, Tool], lift: float, opening: floa
 
 
 def radial_yaw(arm: int, position: Point) -> float:
-    """The hand's yaw [rad] at which its lean points away from the arm's shoulder: the one that all robots reach best."""
+    """The hand's yaw [rad] at which its lean points away from the arm's shoulder; all robots reach it best."""
     x, y = position[:2]
     return side_sign(arm) * float(np.arctan2(0.25 - side_sign(arm) * x, y + 0.45))
 
@@ -124,20 +121,13 @@ def symmetric_yaw(arm: int, position: Point, yaw: float, symmetry: float) -> flo
 def draw_pair(
     rng: np.random.Generator, low: Sequence[float], high: Sequence[float], apart: float, side: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Two points [2] m on one side of the table, at least `apart` [m] from each other.
-
-    Args:
-        rng: random stream.
-        low, high: [4] bounds x y x y on the right side [m].
-        apart: least distance [m].
-        side: 1.0 for the right side, -1.0 for the left, where x is mirrored.
-    """
+    """Two points [2] m at least `apart` [m], between bounds [4] x y x y [m], mirrored to the left for a `side` of -1.0."""
     points = draw(rng, low, high, lambda p: np.hypot(*(p[2:] - p[:2])) >= apart) * [side, 1, side, 1]
     return points[:2], points[2:]
 
 
 def graspable_yaw(rng: np.random.Generator, position: Point, widest: float = WIDEST_TURN) -> float:
-    """A yaw for an object at `position`, either way round, at which the hand on its side takes it across its x axis [rad]."""
+    """A yaw [rad] for an object at `position` at which the hand on its side grasps it across its x axis."""
     return radial_yaw(arm_for(position[0]), position) + rng.uniform(-widest, widest) + np.pi * float(rng.integers(2))
 
 
@@ -154,12 +144,9 @@ def hinge_of(thing: SceneObject) -> Hinge:
 
 
 def lid_point(thing: SceneObject, offset: Point, fraction: float) -> np.ndarray:
-    """World position [3] m of a point of an object's lid.
+    """World position [3] m of a point of a lid hinged about an upright object's -x, opened by a fraction of 0 to 1.
 
-    Args:
-        thing: upright, its lid hinged about an axis along its -x.
-        offset: [3] m from the hinge's anchor to the point at angle 0, in the object's frame.
-        fraction: how far open the lid is, 0 to 1.
+    `offset` [3] m is from the hinge's anchor to the point at angle 0, in the object's frame.
     """
     hinge = hinge_of(thing)
     angle = hinge.lower + fraction * (hinge.upper - hinge.lower)
@@ -173,7 +160,7 @@ def opening_for(width: float, clearance: float = LET_GO) -> float:
 
 
 def hand_yaw(thing: SceneObject) -> float:
-    """Yaw of the hand in the grasp from above by the arm on the object's side [rad], turned as little as symmetry allows."""
+    """Yaw of the hand in the grasp from above by the arm on the object's side [rad], nearest to the radial yaw."""
     return symmetric_yaw(arm_for(thing.pose[0]), thing.pose, thing.yaw, grasp_of(thing).symmetry)
 
 
@@ -183,13 +170,12 @@ def grasp_across(thing: SceneObject, tilt: float = TURN_TILT) -> Tool:
 
 
 def radial_turn(arm: int, start: Point, goal: Point) -> float:
-    """Turn of an object on its way from `start` to `goal` [2] or [3] m, at which the hand stays as radial as it is [rad]."""
+    """Turn of an object on its way from `start` to `goal` [2] or [3] m with a constant angle of the hand to radial [rad]."""
     return radial_yaw(arm, goal) - radial_yaw(arm, start)
 
 
 def easy_turn(thing: SceneObject, goal: Point) -> float:
-    """Turn of an object on its way to a `goal` [2] or [3] m where any yaw will do [rad]: the hand keeps its angle to the radial
-    yaw, limited to `EASY_TURN`."""
+    """Turn of an object on its way to a `goal` [2] or [3] m of any yaw [rad]; its hand is at most EASY_TURN off radial."""
     arm, start = arm_for(thing.pose[0]), hand_yaw(thing)
     offset = np.clip(start - radial_yaw(arm, thing.pose), -EASY_TURN, EASY_TURN)
     return float(radial_yaw(arm, goal) + offset - start)
@@ -210,9 +196,9 @@ def carry(
     above: float = 0.05,
     tilt: float = TURN_TILT,
 ) -> None:
-    """Take an object from above with the arm on its side, set it down with its origin at `goal` [3] m, and draw back.
+    """Grasp an object from above with the arm on its side, set it down with its origin at `goal` [3] m, and move back.
 
-    `turn` is the object's about z on its way [rad]; `lift` and `above` are its heights over its old and its new place [m].
+    `turn` is its rotation about z on its way [rad]; `lift` and `above` are its heights over its old and its new place [m].
     """
     arm, grasp = arm_for(thing.pose[0]), grasp_across(thing, tilt)
     pick(timeline, {arm: grasp}, lift)
@@ -231,25 +217,8 @@ def across(position: Point, direction: float, arm: int) -> Tool:
 
 
 def vessel_pose(position: Point) -> Pose:
-    """A pose upright on the table at (x, y), turned so that a wall segment faces the hand that will take it."""
+    """A pose upright on the table at (x, y), with a wall segment facing the hand on its side."""
     return upright(position[:2], TABLE_TOP, radial_yaw(arm_for(position[0]), position))
-
-
-def rim_grasp(vessel: SceneObject, wall: float, depth: float) -> tuple[int, Tool]:
-    """The arm on whose side a vessel stands, and its grasp from above of the wall on that side.
-
-    Args:
-        vessel: round, standing at `vessel_pose`, so that the hand meets the flat of a wall segment.
-        wall: thickness [m].
-        depth: of the grasp below the rim [m].
-    """
-    position = np.array(vessel.pose[:3])
-    arm = arm_for(position[0])
-    vertices = vessel.shape.mesh.vertices
-    radius = float(np.hypot(*vertices[:, :2].T).max()) - wall / 2
-    yaw = radial_yaw(arm, position)
-    radial = side_sign(arm) * np.array([np.cos(yaw), np.sin(yaw), 0.0])
-    return arm, tool(position + radius * radial + [0, 0, vertices[:, 2].max() - depth], yaw, GRASP_TILT)
 
 
 def carry_by_rim(
@@ -263,27 +232,35 @@ def carry_by_rim(
     above: float = 0.05,
     retreat: float = 0.08,
 ) -> None:
-    """Take a vessel by its rim (`rim_grasp`), set it down with its origin at `goal` [3] m, and draw back by `retreat` [m].
+    """Take a vessel by its rim with the arm on its side and set it down with its origin at `goal` [3] m.
 
-    `lift` and `above` are its heights over its old and its new place [m].
+    Args:
+        timeline: is extended.
+        vessel: round, standing at `vessel_pose`: the hand meets the flat of a wall segment.
+        goal: of its origin, world.
+        wall: thickness [m].
+        depth: of the grasp below the rim [m].
+        lift, above: heights of the vessel over its old and its new place [m].
+        retreat: height by which the hand draws back [m].
     """
-    arm, grasp = rim_grasp(vessel, wall, depth)
-    start = vessel.pose[:3]
+    start = np.array(vessel.pose[:3])
+    arm, vertices = arm_for(start[0]), vessel.shape.mesh.vertices
+    radius = float(np.hypot(*vertices[:, :2].T).max()) - wall / 2
+    yaw = radial_yaw(arm, start)
+    radial = side_sign(arm) * np.array([np.cos(yaw), np.sin(yaw), 0.0])
+    grasp = tool(start + radius * radial + [0, 0, vertices[:, 2].max() - depth], yaw, GRASP_TILT)
     pick(timeline, {arm: grasp}, lift, opening=0.5)
     end = grasp.carried(start, goal, radial_turn(arm, start, goal))
     place(timeline, arm, vessel.name, end, above=above, retreat=retreat, release=0.4)
 
 
 def aside_poses(working: Collection[int]) -> dict[int, Tool]:
-    """Poses where the arms that are not working wait."""
+    """Waiting poses of the idle arms."""
     return {arm: ASIDE[arm] for arm in (LEFT, RIGHT) if arm not in working}
 
 
 def place(timeline: Timeline, arm: int, name: str, goal: Tool, *, above: float, retreat: float, release: float) -> None:
-    """Bring what `arm` has held since its last grip to `goal` from `above` [m], let go, draw back upward and open.
-
-    `release` is the gripper's opening between letting go and being clear of the object and its neighbors.
-    """
+    """Lower the held object to `goal` from `above` [m], open to `release`, move up by `retreat` [m] and open completely."""
     timeline.move({arm: goal.moved(z=above)})
     timeline.move({arm: goal})
     timeline.hold(arm, name)

@@ -1,7 +1,7 @@
 """Procedural bimanual robots: a body is a function of its number, the same bytes on every machine.
 
-`design_body` draws what a candidate is, `body_files` makes its URDF and meshes; neither knows where it stands. `load_body`
-gives the robot `body:17`: the candidate that the catalog names, with its base poses and homes.
+`design_body` draws a candidate, `body_files` makes its URDF and meshes, both without a place. `load_body` gives the robot
+`body:17`: the candidate of the catalog's entry, with its base poses and homes.
 """
 
 from xew.sim_warp.robots.procedural.bodies import load_body

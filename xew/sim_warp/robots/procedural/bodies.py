@@ -1,9 +1,7 @@
 """Bodies by their number: `body:17` is a candidate of the catalog with its base poses and homes.
 
-Reads  catalog.json: the candidates that follow the trial plans and succeed in physics, in order
-Writes the URDF and meshes of each requested body once, to the user's cache folder, under a digest of the code that makes them
-
-Everything that the catalog does not hold is a function of the number.
+catalog.json lists the candidates that follow the trial plans and succeed in physics. All other properties are functions of the
+number. URDFs and meshes are written once to the user's cache folder, under a digest of the code.
 """
 
 import hashlib
@@ -35,7 +33,7 @@ AT_ORIGIN: Pose = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 @dataclass(frozen=True)
 class Entry:
-    """What the catalog holds of a body; left arm first."""
+    """Catalog entry of a body; left arm first."""
 
     candidate: int
     """Number of the design."""
@@ -46,7 +44,7 @@ class Entry:
 
 @dataclass(frozen=True)
 class Catalog:
-    """The bodies that work, by number."""
+    """The usable bodies, by number."""
 
     bodies: tuple[Entry, ...]
 
@@ -59,10 +57,7 @@ def body_number(name: str) -> int | None:
 
 @cache
 def load_body(number: int) -> RobotSpec:
-    """A procedural body.
-
-    Args:
-        number: from 0 to one less than the catalog has entries.
+    """A procedural body of the catalog, from 0.
 
     Raises:
         ConfigError: there is no body of that number, or the user's cache folder cannot be written.
@@ -75,7 +70,7 @@ def load_body(number: int) -> RobotSpec:
 
 @cache
 def read_catalog(path: Path = CATALOG) -> tuple[Entry, ...]:
-    """The entries of a catalog, by number. Raises ConfigError if its content is no catalog."""
+    """The entries of a catalog, by number. Raises ConfigError if it is invalid."""
     return parse(Catalog, read_json(path), str(path)).bodies
 
 
@@ -89,7 +84,7 @@ def placed_body(entry: Entry, key: str, title: str) -> RobotSpec:
 
 
 def unplaced_body(body: BodyDesign, key: str, title: str) -> RobotSpec:
-    """The robot of a design at the world's origin, with all joints at 0; missing files are written."""
+    """The robot of a design at the world's origin, with all joints at 0; writes missing files."""
     x, y, z = body.flange
     count, stroke = len(body.joints), body.hand.stroke
     arm = Arm(
@@ -115,7 +110,7 @@ def unplaced_body(body: BodyDesign, key: str, title: str) -> RobotSpec:
 
 
 def keep_files(body: BodyDesign) -> Path:
-    """The URDF of a design in the user's cache folder, written with its meshes if it is not there yet.
+    """The URDF of a design in the user's cache folder, written with its meshes if missing.
 
     Raises:
         ConfigError: the folder cannot be written.
@@ -133,13 +128,13 @@ def keep_files(body: BodyDesign) -> Path:
     except OSError as error:
         if path.is_file():  # another process was faster
             return path
-        raise ConfigError(f"cannot write {folder}: {error.strerror}. Name another cache folder by XDG_CACHE_HOME.") from error
+        raise ConfigError(f"cannot write {folder}: {error.strerror}. Set XDG_CACHE_HOME to another folder.") from error
     return path
 
 
 @cache
 def content_version() -> str:
-    """Digest of all that decides a body's bytes and arrays: the code that makes and reads them, and the libraries it calls."""
+    """Digest of the code and the versions of the libraries that make and read a body's files."""
     digest = hashlib.sha256(f"{np.__version__} {scipy.__version__} {trimesh.__version__}".encode())
     for module in (design, colors, shapes, urdf_files, solids, mesh_files, meshes, prepared, urdf):
         digest.update(Path(str(module.__file__)).read_bytes())

@@ -1,11 +1,10 @@
-"""What a procedural body is: its arm's joints, its looks and its hand, drawn from the number of the body alone.
+"""Design of a procedural body from its number: the arm's joints, its appearance and its hand.
 
-A body is one arm that is put up twice. At zero joint positions all link frames are parallel to the base: x ahead, z up, so an
-axis and an offset read the same in every link. Lengths lie within those of real arms (the five robots of this project,
-reaches of .6 to .95 m); colors are those of real arms and beyond.
+A body has two copies of one arm. At zero joint positions all link frames are parallel to the base: x ahead, z up. Lengths are
+within the range of real arms (reaches of 0.6 to 0.95 m).
 
-Numbers from `WIDE` on are of a second family, in which sizes and roots differ more: its arms are the same kinds drawn to any
-reach from .5 to 1 m, on bases like those of the first family or on stands whose foot is the root, up to the floor's.
+Numbers from `WIDE` on are of a second family with larger variation: the same kinds of arm with reaches from 0.5 to 1 m, on
+bases of the first family or on stands, whose foot is the root.
 """
 
 from collections.abc import Callable
@@ -25,8 +24,7 @@ STYLES = ("tube", "shell", "box", "frame")
 FINGERS = ("paddle", "bar", "jaw", "wedge")
 """Shapes of fingers behind their pads."""
 MOUNTS = ("upright", "tilted", "frame")
-"""Kinds of base: a foot, a wedge on which the base leans forward or back, a column that is part of the base and ends below the
-root."""
+"""Kinds of base: a foot, a wedge that leans the base forward or back, a column of the base that ends below the root."""
 WIDE = 1_000_000
 """Number of the first design of the wide family."""
 WIDE_REACH = (0.5, 1.0)
@@ -51,12 +49,12 @@ class JointDesign:
 
 @dataclass(frozen=True)
 class Look:
-    """What the links look like."""
+    """Appearance of the links."""
 
     styles: tuple[str, ...]
-    """Style of each link that a joint moves, of STYLES."""
+    """Style of each moving link, of STYLES."""
     body: tuple[int, int, int]
-    """sRGB of the links; every other link has `second`."""
+    """sRGB of the links; every second link has `second`."""
     second: tuple[int, int, int]
     housing: tuple[int, int, int]
     accent: tuple[int, int, int]
@@ -67,7 +65,7 @@ class Look:
     rings: int
     """Number of accent rings round each long link."""
     cable: bool
-    """Whether a cable runs along the outside of the long links."""
+    """Whether long links have an outside cable."""
 
 
 @dataclass(frozen=True)
@@ -79,14 +77,14 @@ class HandDesign:
     finger_length: float
     """From the palm to the fingertip [m]."""
     stroke: float
-    """Way of each finger from closed to open [m]."""
+    """Travel of each finger from closed to open [m]."""
     finger: str
     """Shape, of FINGERS."""
 
 
 @dataclass(frozen=True)
 class BodyDesign:
-    """A procedural robot without a place to stand."""
+    """A procedural robot without a place."""
 
     number: int
     family: str
@@ -107,11 +105,7 @@ class BodyDesign:
 
 
 def design_body(number: int) -> BodyDesign:
-    """The design of a body; equal numbers give equal designs.
-
-    Args:
-        number: from 0.
-    """
+    """The design of a body, numbered from 0; equal numbers give equal designs."""
     is_wide = number >= WIDE
     rng = _stream(number, "arm")
     family = _choose(rng, tuple(FAMILIES))
@@ -151,7 +145,7 @@ def _resize(joints: tuple[JointDesign, ...], flange: Vector, size: float) -> tup
 
 
 def _stream(number: int, part: str) -> np.random.Generator:
-    """Random numbers for one part of a body, so that a change of one part changes no other."""
+    """Random numbers for one part of a body, independent of the other parts."""
     return np.random.Generator(np.random.Philox(key=[number, int.from_bytes(part.encode(), "big")]))
 
 
@@ -187,7 +181,7 @@ def _yaw_wrist(rng: np.random.Generator) -> tuple[tuple[JointDesign, ...], Vecto
 
 
 def _offset_wrist(rng: np.random.Generator) -> tuple[tuple[JointDesign, ...], Vector]:
-    """Six joints beside one another, as UR5's: three bend in parallel planes, then across, then along the hand."""
+    """Six joints with lateral offsets, as UR5's: three bend in parallel planes, then across, then along the hand."""
     upper, fore = _length(rng, 0.28, 0.42), _length(rng, 0.26, 0.39)
     side, back = _length(rng, 0.08, 0.13), _length(rng, 0.06, 0.11)
     joints = (
@@ -232,7 +226,7 @@ def _shoulder(rng: np.random.Generator, side: float, ahead: float) -> tuple[Join
     )
 
 
-# --- Looks and hands.
+# --- Appearance and hands.
 
 
 def _look(rng: np.random.Generator, joints: int) -> Look:

@@ -26,20 +26,19 @@ from xew.sim_warp.robots.procedural.solids import (
 LONG = 0.12
 """Length from which a link carries rings and a cable [m]."""
 TIP_MARGIN = 0.015
-"""Length by which fingertips stand out beyond the tool center point [m]."""
+"""Length of the fingertips beyond the tool center point [m]."""
 
 
 @dataclass(frozen=True)
 class LinkShape:
-    """What one link looks like and collides with."""
+    """Visible parts and collision boxes of one link."""
 
     parts: list[Part]
     boxes: tuple[Box, ...]
 
 
 def base_shape(design: BodyDesign) -> LinkShape:
-    """The foot, the column of a frame or the wedge below a base that leans, and the pedestal below the first joint; all of it
-    on the stand, where there is one."""
+    """The base: foot, column or wedge, the pedestal below the first joint, and the stand, if any."""
     radius, height = design.look.radii[0], design.joints[0].origin[2] - design.stand
     wide = 1.5 * radius
     parts: list[Part] = [("housing", cylinder((0, 0, 0), (0, 0, height), 1.15 * radius, radius))]
@@ -94,7 +93,7 @@ def link_shape(design: BodyDesign, index: int) -> LinkShape:
 
 
 def palm_shape(hand: HandDesign, flange: Vector) -> LinkShape:
-    """The hand's body on the last link: a palm that ends in the rail on which the fingers slide."""
+    """The hand's body on the last link: a palm with the rail of the fingers."""
     depth, width, height = hand.palm
     x, y, z = flange
     body = loft(
@@ -111,7 +110,7 @@ def palm_shape(hand: HandDesign, flange: Vector) -> LinkShape:
 
 
 def finger_shape(hand: HandDesign, side: int) -> LinkShape:
-    """A finger whose frame lies where palm and closed pads meet; it opens toward `side` (+1, -1) of y."""
+    """A finger with its frame at the meeting point of palm and closed pads; it opens toward `side` (+1, -1) of y."""
     length = hand.finger_length
     inner, outer = sorted((0.0, side * PAD_THICKNESS))
     pad = Box((length - 0.035, inner, -PAD_HALF_WIDTH), (length, outer, PAD_HALF_WIDTH), name="pad")

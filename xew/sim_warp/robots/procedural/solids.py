@@ -1,4 +1,4 @@
-"""The few solids that robot shapes are built from. Meters; frames are those of the link that carries the shape."""
+"""Basic solids of robot shapes, in meters and the frame of the link."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -91,8 +91,7 @@ def loft(axis: str, stations: Sequence[Sequence[float]], rpy: Vector = (0, 0, 0)
 
     Args:
         axis: "x", "y" or "z".
-        stations: (position, low, high, low, high) of each, the extents being those of the other two axes in order [m],
-            as link cross sections are listed in mesh surveys.
+        stations: (position, low, high, low, high) of each, with the extents along the other two axes in order [m].
         rpy: turn of the whole [rad].
         corner: share of a half side that is rounded off.
     """

@@ -70,7 +70,7 @@ def material_element(name: str, color: Color) -> ElementTree.Element:
 
 
 def visual_element(mesh: str, material: str) -> ElementTree.Element:
-    """A visual that shows the mesh file `mesh`, a path relative to the URDF, in a named material."""
+    """A visual of the mesh file `mesh`, a path relative to the URDF, in a named material."""
     visual = ElementTree.Element("visual")
     ElementTree.SubElement(ElementTree.SubElement(visual, "geometry"), "mesh", filename=mesh)
     ElementTree.SubElement(visual, "material", name=material)
@@ -86,13 +86,13 @@ def collision_element(box: Box) -> ElementTree.Element:
 
 
 def _mesh_bytes(solid: trimesh.Trimesh) -> bytes:
-    """Binary STL of vertices in hundredths of a millimeter, so that the last bit of a sine changes no byte."""
+    """Binary STL of vertices rounded to hundredths of a millimeter, the same bytes on all machines."""
     rounded = trimesh.Trimesh(np.round(solid.vertices, 5) + 0.0, solid.faces, process=False)
     return bytes(rounded.export(file_type="stl"))
 
 
 def _inertial(boxes: Sequence[Box]) -> ElementTree.Element:
-    """Mass and inertia of solid boxes, taken as one box round all of them."""
+    """Mass and inertia of solid boxes, approximated by their bounding box."""
     low, high = np.min([box.low for box in boxes], 0), np.max([box.high for box in boxes], 0)
     size = high - low
     mass = max(DENSITY * float(sum(np.prod(box.size) for box in boxes)), 0.05)

@@ -1,6 +1,6 @@
-"""Robots of a user's own: from the path of a URDF to a `RobotSpec`, with what was left open found or refused.
+"""Users' robots: from the path of a URDF to a `RobotSpec`, with inferred entries for missing ones.
 
-They are kept beside the data that were made with them, so that a data set can always be read again.
+A data set holds copies of the users' robots that made it.
 """
 
 __all__ = ["draft", "infer", "own", "placement", "trials"]

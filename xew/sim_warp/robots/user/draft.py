@@ -1,9 +1,6 @@
-"""Descriptions of users' robots as `RobotDraft`s, most of which may be left open.
+"""Descriptions of users' robots as `RobotDraft`s, from a URDF, a robot.yaml or a RoboTwin embodiment (config.yml).
 
-Reads  a URDF, a folder with a robot.yaml, or a RoboTwin embodiment folder (config.yml)
-Writes RobotDraft; `xew.sim_warp.robots.user.own` fills in what is open
-
-A robot.yaml holds the fields of RobotDraft and nothing else; lengths in meters, angles in radians, quaternions x y z w.
+A robot.yaml has the fields of RobotDraft, in meters, radians and quaternions x y z w. `own` completes missing fields.
 """
 
 from dataclasses import dataclass
@@ -17,26 +14,26 @@ from xew.config import ConfigError, parse, read_yaml
 from xew.sim_warp.geometry.poses import Pose
 
 OWN, ROBOTWIN = "robot.yaml", "config.yml"
-"""Names of the file that describes a robot in our own way, and in RoboTwin's."""
+"""Names of xew's and RoboTwin's file that describes a robot."""
 Near = tuple[np.ndarray | None, np.ndarray | None]
-"""Postures [d] rad near which homes of the left and right arm are sought; None is near the joints' zero."""
+"""Postures [d] rad near which homes of the left and right arm are searched; None for zero."""
 
 
 @dataclass(frozen=True)
 class ArmDraft:
-    """One arm, see `xew.sim_warp.robots.Arm`; `xew.sim_warp.robots.user.infer` or `placement` fill in what is None."""
+    """One arm, see `xew.sim_warp.robots.Arm`; `infer` or `placement` find missing fields."""
 
     root_pose: Pose | None = None
     joints: tuple[str, ...] | None = None
     home: tuple[float, ...] | None = None
     near: tuple[float, ...] | None = None
-    """Posture to search the home from, if home is left open [rad]."""
+    """Start posture for the search of a missing home [rad]."""
     rest: tuple[float, ...] | None = None
-    """Posture in which motion of its own begins [rad]; open: home."""
+    """Initial posture of own motion [rad]; default: home."""
     tool_link: str | None = None
     tool_pose: Pose | None = None
     tool_at_tips: bool = False
-    """True takes only the orientation of `tool_pose`; the origin is the place at the fingers where all our robots have it."""
+    """Whether to use only the orientation of `tool_pose`, with the origin at the fingers as for xew's robots."""
     fingers: tuple[str, str] | None = None
     finger_closed: tuple[float, float] | None = None
     finger_open: tuple[float, float] | None = None
@@ -44,29 +41,29 @@ class ArmDraft:
 
 @dataclass(frozen=True)
 class RobotDraft:
-    """A bimanual robot, or one arm that is put up twice."""
+    """A bimanual robot, or two copies of one arm."""
 
     urdf: str
-    """Path of the URDF, relative to the file that says so."""
+    """Path of the URDF, relative to the description."""
     title: str | None = None
     arms: tuple[ArmDraft, ArmDraft] = (ArmDraft(), ArmDraft())
-    """Left and right arm. What only the left says holds for the right too, but for `root_pose`, `home` and `rest`."""
+    """Left and right arm; a missing right arm is like the left, except for `home` and `rest`."""
     joint_lower: tuple[float, ...] | None = None
-    """Limits that experts keep [rad]; open: the URDF's."""
+    """Expert limits [rad]; default: the URDF's."""
     joint_upper: tuple[float, ...] | None = None
     joint_velocity: tuple[float, ...] | None = None
-    """Speed limits that experts keep [rad/s]; open: the URDF's."""
+    """Speed limits of experts [rad/s]; default: the URDF's."""
     joint_acceleration: tuple[float, ...] | None = None
-    """Acceleration limits that motion of its own keeps [rad/s²]; open: 15 of each joint."""
+    """Acceleration limits of own motion [rad/s²]; default: 15 for each joint."""
     distance: float | None = None
-    """Distance between the bases of two equal arms [m], half to either side of `root_pose`; open: the first of
+    """Distance between the bases of two equal arms [m], half to either side of `root_pose`; default: the first of
     `placement.DISTANCES` at which both arms reach home."""
     source: str | None = None
-    """SHA-256 of the description that a robot in a data set comes from; leave it out."""
+    """SHA-256 of the original description of a robot in a data set; do not set it."""
 
 
 def find_description(path: Path) -> Path:
-    """The file that describes the robot at `path`: itself, or of a folder robot.yaml, config.yml or its only URDF.
+    """The file that describes the robot at `path`: the file, or a folder's robot.yaml, config.yml or only URDF.
 
     Raises:
         ConfigError: there is none, or more than one.
@@ -86,7 +83,7 @@ def find_description(path: Path) -> Path:
 
 
 def read_draft(description: Path) -> RobotDraft:
-    """What a URDF, a robot.yaml or a RoboTwin config.yml says. Raises ConfigError if it cannot be understood."""
+    """Read a URDF, a robot.yaml or a RoboTwin config.yml. Raises ConfigError if it is invalid."""
     if description.suffix == ".urdf":
         return RobotDraft(description.name)
     if description.suffix == ".xacro":
@@ -105,11 +102,10 @@ def read_draft(description: Path) -> RobotDraft:
 def robotwin_draft(config: dict[str, Any], source: str) -> RobotDraft:
     """A RoboTwin 2.0 embodiment (its config.yml) as a draft.
 
-    Taken: URDF, arm joints, gripper joints with their scale, the tool frame's link and orientation (ee joint, `delta_matrix`),
-    base poses, and `homestate` as the posture near which our home is looked for. `gripper_bias` is where RoboTwin's planner
-    has its tool center point, 5 to 29 mm behind ours: our plans count on fingertips that are 15 mm beyond it.
-    `global_trans_matrix` undoes the orientation that SAPIEN gives joint frames and has no part in ours; drive gains, planner,
-    cameras, `rotate_lim` and `grasp_perfect_direction` belong to RoboTwin's experts.
+    Used: URDF, arm joints, gripper joints with their scale, the tool frame's link and orientation (ee joint, `delta_matrix`),
+    base poses, and `homestate` as the start of the search for a home. RoboTwin's tool center point (`gripper_bias`) is 5 to
+    29 mm behind xew's, which is 15 mm behind the fingertips. `global_trans_matrix` is for SAPIEN's joint frames; other keys are
+    for RoboTwin's experts.
 
     Raises:
         ConfigError: a key is missing or not as it should be.
@@ -153,7 +149,7 @@ def _robotwin_arm(reader: "_Reader", side: int, tool: Pose) -> ArmDraft:
 
 
 def _unit_quaternion(quaternion: np.ndarray, reader: "_Reader") -> tuple[float, float, float, float]:
-    """The quaternion [4] at unit length, for RoboTwin writes .707 for the root of a half."""
+    """The quaternion [4] at unit length; RoboTwin rounds to three digits."""
     length = float(np.linalg.norm(quaternion))
     if not 0.9 < length < 1.1:
         raise reader.error("robot_pose", "unit quaternions w x y z")
@@ -163,21 +159,21 @@ def _unit_quaternion(quaternion: np.ndarray, reader: "_Reader") -> tuple[float, 
 
 @dataclass(frozen=True)
 class _Reader:
-    """Takes values out of a config and says what is wrong with it."""
+    """Checked access to the values of a config."""
 
     config: dict[str, Any]
     source: str
 
     def value(self, key: str, kind: type) -> Any:
-        """The value of a key, which must be there and of a type."""
+        """The value of a required key and type."""
         if key not in self.config:
-            raise ConfigError(f"{self.source}: missing key {key!r}; a RoboTwin embodiment has it.")
+            raise ConfigError(f"{self.source}: missing key {key!r}; expected the keys of a RoboTwin embodiment.")
         if not isinstance(self.config[key], kind):
             raise self.error(key, f"a {kind.__name__}")
         return self.config[key]
 
     def per_side(self, key: str, side: int) -> Any:
-        """The left (first) or right (last) entry of a list; with one entry both are the same."""
+        """The left (first) or right (last) entry of a list of one or two."""
         entries = self.value(key, list)
         if not entries:
             raise self.error(key, "one entry an arm")

@@ -1,12 +1,8 @@
-"""Conversion of hands to two sliding fingers: linked and turning fingers, and arms without a hand.
-
-Reads  a URDF and its tree
-Writes the tree with two prismatic finger joints a hand
+"""Conversion of linked and turning fingers, and of arms without a hand, to hands with two sliding fingers.
 
 Physics has one hand for all robots: two fingers that slide apart by the same distance. `slide_fingers` puts links that mimic
-joints move together onto two slides: closed, each link is where it was; both fingers open as far as their tips did. The turn
-of the links on the way is left out, which is nothing for parallel grippers. `graft_hand` puts the hand of one of the project's
-robots on an arm.
+joints move together onto two slides: closed, each link is where it was; both fingers open as far as their tips did. Turns of
+the links are ignored; parallel grippers have none. `graft_hand` mounts the hand of one of xew's robots on an arm.
 """
 
 import xml.etree.ElementTree as ElementTree
@@ -25,26 +21,26 @@ from xew.sim_warp.kinematics.forward import joint_motion
 from xew.sim_warp.robots.user.posed import moved_points, nearest_axis, pose_links
 
 TIP = 0.02
-"""Part of a finger from its farthest point on that counts as its tip [m]."""
+"""Length of a fingertip [m]."""
 LEAST_STROKE = 0.002
-"""Least way of a finger [m]."""
+"""Least travel of a finger [m]."""
 ON_AXIS = np.cos(np.radians(5))
 FINGER_SPEED, FINGER_EFFORT = 0.3, 20.0
 """Limits of the slides [m/s], [N]; physics has its own."""
 HAND = "hand_"
-"""Beginning of the names of links and joints of a grafted hand."""
-OTHER_HAND = "expected two that open alike. Give the arm one of the project's hands: --hand ur5_wsg."
+"""Prefix of the names of a grafted hand's links and joints."""
+OTHER_HAND = "expected two that open equally. Mount one of xew's hands: --hand ur5_wsg."
 
 
 @dataclass(frozen=True)
 class Linkage:
-    """Joints that one joint drives."""
+    """Joints driven by one joint."""
 
     base: str
-    """Link that carries all of them."""
+    """Common parent link."""
     driver: Joint
     joints: tuple[Joint, ...]
-    """The driver and what mimics it, each with factor and offset (`positions`)."""
+    """The driver and its mimics."""
     factors: Mapping[str, tuple[float, float]]
     """Factor and offset by joint: position = factor * driver's + offset."""
 
@@ -54,14 +50,10 @@ class Linkage:
 
 
 def slide_fingers(tree: ElementTree.Element, urdf: Urdf) -> list[str]:
-    """Put linked fingers on two slides a hand; hands that have two sliding fingers on one link stay as they are.
-
-    Args:
-        tree: of the URDF; is changed.
-        urdf: the same as read.
+    """Put linked fingers on two slides per hand, except hands with two sliding fingers on one link, in the URDF's `tree`.
 
     Returns:
-        A sentence for each hand that was changed.
+        A sentence for each changed hand.
 
     Raises:
         ConfigError: a driving joint has no limits, or only one finger moves.
@@ -70,13 +62,14 @@ def slide_fingers(tree: ElementTree.Element, urdf: Urdf) -> list[str]:
 
 
 def find_linkages(urdf: Urdf) -> list[Linkage]:
-    """Fingers that move together by mimic joints, but for pairs of slides on one link."""
+    """Fingers that move together by mimic joints, except pairs of slides on one link."""
     factors: dict[str, dict[str, tuple[float, float]]] = {}
     for joint in urdf.joints.values():
         name, factor, offset = joint.name, 1.0, 0.0
         while (mimic := urdf.joints[name].mimic) is not None and mimic[0] in urdf.joints and mimic[0] != joint.name:
             name, factor, offset = mimic[0], factor * mimic[1], factor * mimic[2] + offset
-        if joint.kind != "fixed" and (name != joint.name or _is_driver(joint, urdf)):
+        drives = any(other.mimic is not None and other.mimic[0] == joint.name for other in urdf.joints.values())
+        if joint.kind != "fixed" and (name != joint.name or drives):
             factors.setdefault(name, {})[joint.name] = (factor, offset)
     linkages = []
     for name, driven in factors.items():
@@ -86,12 +79,8 @@ def find_linkages(urdf: Urdf) -> list[Linkage]:
     return linkages
 
 
-def _is_driver(joint: Joint, urdf: Urdf) -> bool:
-    return any(other.mimic is not None and other.mimic[0] == joint.name for other in urdf.joints.values())
-
-
 def _common_link(urdf: Urdf, joints: tuple[Joint, ...]) -> str:
-    """The last link that is on the way to all joints."""
+    """The last common link of the chains to all joints."""
     ways = [[urdf.root, *(above.child for above in urdf.chain(joint.parent))] for joint in joints]
     return [links[0] for links in zip(*ways, strict=False) if len(set(links)) == 1][-1]
 
@@ -99,7 +88,7 @@ def _common_link(urdf: Urdf, joints: tuple[Joint, ...]) -> str:
 def _slide(tree: ElementTree.Element, urdf: Urdf, linkage: Linkage, number: int) -> str:
     driver = linkage.driver
     if not np.isfinite(driver.upper - driver.lower) or driver.upper - driver.lower < 1e-4:
-        raise ConfigError(f"{urdf.path}: the finger joint {driver.name} has no limits between which it opens.")
+        raise ConfigError(f"{urdf.path}: the finger joint {driver.name} has no limits; expected its closed and open positions.")
     tops = _topmost(urdf, linkage)
     ends = [_finger_points(urdf, linkage, tops, end) for end in (driver.lower, driver.upper)]
     fingers, approach = _choose_fingers(ends[0])
@@ -120,45 +109,46 @@ def _slide(tree: ElementTree.Element, urdf: Urdf, linkage: Linkage, number: int)
         if joint in tops:
             side = float((ends[shut][joint.name].mean(0) - middle) @ opening)
             first = joint.name == fingers[0] or (joint.name != fingers[1] and side > 0)
-            _set_parent(tree, joint, f"{linkage.base}_slide_{number}{'ab'[not first]}")
+            parent = _element(tree, joint).find("parent")
+            parent.set("link", f"{linkage.base}_slide_{number}{'ab'[not first]}")  # type: ignore[union-attr]
             origin = np.linalg.inv(frames[linkage.base]) @ frames[joint.parent] @ origin
         _fix(tree, joint, origin @ joint_motion(joint, np.array([linkage.positions(closed)[joint.name]]))[0])
     for letter, sign in (("a", 1.0), ("b", -1.0)):
         _add_slide(tree, linkage.base, f"{linkage.base}_slide_{number}{letter}", sign * opening, stroke)
     turn = _turn(urdf, linkage, fingers[0])
     return (
-        f"the hand on {linkage.base}, driven by {driver.name}, is taken for two fingers that slide {1000 * stroke:.0f} mm "
-        f"each; its fingertips turn by {turn:.0f} deg as they open, which is left out"
+        f"the hand on {linkage.base}, driven by {driver.name}, is replaced by two fingers that slide "
+        f"{1000 * stroke:.0f} mm each; its fingertips turn by {turn:.0f} deg as they open, which is ignored"
     )
 
 
 def _topmost(urdf: Urdf, linkage: Linkage) -> list[Joint]:
-    """The joints of a linkage that no other one of it carries."""
+    """The joints of a linkage that are not below another of its joints."""
     names = {joint.name for joint in linkage.joints}
     return [j for j in linkage.joints if not any(above.name in names for above in urdf.chain(j.parent))]
 
 
 def _finger_points(urdf: Urdf, linkage: Linkage, tops: list[Joint], driven: float) -> dict[str, np.ndarray]:
-    """Points [k 3] m of all that each of the topmost joints carries, in the frame of the linkage's base."""
+    """Points [k 3] m below each of the topmost joints, in the frame of the linkage's base."""
     poses = pose_links(urdf, linkage.positions(driven))
     return {top.name: moved_points(urdf, top.name, poses, poses[linkage.base]) for top in tops}
 
 
 def _choose_fingers(points: Mapping[str, np.ndarray]) -> tuple[list[str], np.ndarray]:
-    """The two branches that reach farthest, and the direction [3] in which they do."""
+    """The two branches of the farthest reach, and its direction [3]."""
     approach = np.mean([cloud.mean(0) for cloud in points.values()], axis=0)
     axis = nearest_axis(approach)
     return sorted(points, key=lambda name: -float((points[name] @ axis).max()))[:2], axis
 
 
 def _tip(points: np.ndarray, approach: np.ndarray) -> np.ndarray:
-    """The middle [3] of the part of a finger that is farthest out."""
+    """The center [3] of a fingertip."""
     along = points @ approach
     return points[along > along.max() - TIP].mean(0)
 
 
 def _on_axis(direction: np.ndarray, approach: np.ndarray) -> np.ndarray:
-    """The unit vector across the approach that is nearest to a direction; an axis of the base's where that is near."""
+    """The unit vector across the approach nearest to a direction, snapped to a near axis of the base."""
     across = direction - approach * (direction @ approach)
     across /= max(float(np.linalg.norm(across)), 1e-12)
     axis = nearest_axis(across)
@@ -166,7 +156,7 @@ def _on_axis(direction: np.ndarray, approach: np.ndarray) -> np.ndarray:
 
 
 def _turn(urdf: Urdf, linkage: Linkage, finger: str) -> float:
-    """By how much the farthest link of a finger turns from end to end [deg]."""
+    """Turn of the last link of a finger from end to end [deg]."""
     last = max(urdf.links, key=lambda link: len(urdf.chain(link)) * (urdf.joints[finger] in urdf.chain(link)))
     positions = [linkage.positions(end) for end in (linkage.driver.lower, linkage.driver.upper)]
     ends = [pose_links(urdf, position)[last][:3, :3] for position in positions]
@@ -178,10 +168,6 @@ def _turn(urdf: Urdf, linkage: Linkage, finger: str) -> float:
 
 def _element(tree: ElementTree.Element, joint: Joint) -> ElementTree.Element:
     return next(entry for entry in tree.findall("joint") if entry.get("name") == joint.name)
-
-
-def _set_parent(tree: ElementTree.Element, joint: Joint, link: str) -> None:
-    _element(tree, joint).find("parent").set("link", link)  # type: ignore[union-attr]
 
 
 def _fix(tree: ElementTree.Element, joint: Joint, origin: np.ndarray) -> None:
@@ -213,7 +199,7 @@ def _set_origin(joint: ElementTree.Element, pose: np.ndarray) -> None:
 
 
 def _roll_pitch_yaw(rotation: np.ndarray) -> np.ndarray:
-    """Angles [3] rad of a rotation matrix as URDF has them; where roll and yaw are the same turn, all of it is roll."""
+    """URDF's angles [3] rad of a rotation matrix; at the singularity yaw is 0."""
     across = np.hypot(rotation[0, 0], rotation[1, 0])
     pitch = np.arctan2(-rotation[2, 0], across)
     if across < 1e-9:
@@ -225,20 +211,13 @@ def _numbers(values: np.ndarray) -> str:
     return " ".join(f"{value + 0.0:.9g}" for value in np.round(values, 9))
 
 
-# --- Hands of the project's robots.
+# --- Hands of xew's robots.
 
 
 def graft_hand(tree: ElementTree.Element, urdf: Urdf, robot: RobotSpec, last_joint: str | None = None) -> str:
-    """Put the hand of one of the project's robots on an arm, in place of whatever moves beyond its last joint.
+    """Replace all moving links beyond an arm's last joint with a robot's hand, in the `tree` of a URDF of one arm.
 
-    Args:
-        tree: of a URDF of one arm; is changed.
-        urdf: the same as read.
-        robot: whose hand it is.
-        last_joint: name of the arm's last joint; None takes the joint before the first that carries two.
-
-    Returns:
-        A sentence on where the hand is.
+    `last_joint` is the joint before the first branch by default. Returns a sentence on the hand's place.
     """
     if last_joint is not None and last_joint not in urdf.joints:
         raise ConfigError(f"{urdf.path} has no joint {last_joint}; it has {', '.join(urdf.joint_names)}.")
@@ -261,11 +240,11 @@ def graft_hand(tree: ElementTree.Element, urdf: Urdf, robot: RobotSpec, last_joi
     ElementTree.SubElement(mount, "parent", link=flange)
     ElementTree.SubElement(mount, "child", link=f"{HAND}{hand}")
     _set_origin(mount, pose)
-    return f"the hand of {robot.title} is put on {flange}, pointing along {_numbers(approach)} of it"
+    return f"the hand of {robot.title} is mounted on {flange}, pointing along {_numbers(approach)} of it"
 
 
 def _last_arm_joint(urdf: Urdf) -> Joint:
-    """The joint up to which each moving joint carries one other."""
+    """The joint before the first branch of moving joints."""
     link, last = urdf.root, None
     while True:
         following = _next_moving(urdf, link)
@@ -279,7 +258,7 @@ def _last_arm_joint(urdf: Urdf) -> Joint:
 
 
 def _next_moving(urdf: Urdf, link: str) -> list[Joint]:
-    """The moving joints below a link that no other moving joint below it carries."""
+    """The first moving joints below a link."""
     moving: list[Joint] = []
     for joint in urdf.joints.values():
         if joint.parent == link:
@@ -288,7 +267,7 @@ def _next_moving(urdf: Urdf, link: str) -> list[Joint]:
 
 
 def _cut_beyond(tree: ElementTree.Element, urdf: Urdf, last: Joint) -> None:
-    """Remove all that is carried by a branch beyond a joint in which something moves."""
+    """Remove all moving links beyond a joint."""
     gone = {
         link
         for link in urdf.links
@@ -300,7 +279,7 @@ def _cut_beyond(tree: ElementTree.Element, urdf: Urdf, last: Joint) -> None:
 
 
 def _child(joint: ElementTree.Element) -> str | None:
-    """The name of the link that a joint carries."""
+    """The name of a joint's child link."""
     child = joint.find("child")
     return None if child is None else child.get("link")
 

@@ -1,9 +1,6 @@
-"""Inference from a URDF: its hands, the joints of its arms, its tool frame, the closing direction of its fingers, its limits.
+"""Inference from a URDF: hands, joints of arms, tool frames, closing direction of fingers, limits.
 
-Reads  a Urdf and a RobotDraft
-Writes arms (`complete_arms`) and limits (`complete_limits`); only bases and homes may stay open
-
-Where a URDF is ambiguous, a ConfigError says which field of robot.yaml decides.
+If a URDF is ambiguous, a ConfigError names the field of robot.yaml that decides.
 """
 
 import math
@@ -22,21 +19,20 @@ from xew.sim_warp.robots.user.posed import moved_points, nearest_axis, pose_link
 
 ARM_JOINTS = (6, 7)
 TIP_MARGIN = 0.015
-"""Distance of the tool frame behind the finger tips [m], as on our own robots."""
+"""Distance of the tool frame behind the fingertips [m], as for xew's robots."""
 SNAP = math.cos(math.radians(20))
-"""Cosine of the largest angle at which an approach direction is taken to be the axis of the hand that is nearest: 20 degrees.
-"""
+"""Cosine of the largest angle at which an approach direction snaps to the nearest axis of the hand."""
 LARGEST_ANGLE = 2 * math.pi
-"""Largest position limit [rad]; one beyond it is a placeholder."""
+"""Largest position limit [rad]; larger limits are placeholders."""
 LARGEST_SPEED, DEFAULT_SPEED = 10.0, 3.0
-"""Largest speed limit [rad/s], and the one that is used where the URDF has none, 0 or a larger one: those are placeholders."""
+"""Largest speed limit [rad/s], and the default if the URDF has none, 0 or a larger one, which are placeholders."""
 IDENTITY = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 STROKE_TOLERANCE = 1e-3
-"""Largest difference between the strokes of the two fingers of a hand, which move together [m]."""
+"""Largest difference between the strokes of a hand's two fingers [m]."""
 
 
 def complete_arms(draft: RobotDraft, urdf: Urdf, source: str) -> tuple[Arm, Arm]:
-    """Left and right arm with nothing open but homes and bases."""
+    """Left and right arm, complete except for homes and bases."""
     drafts = fill_right_arm(draft.arms)
     hands = [] if all(arm.fingers for arm in drafts) else find_fingers(urdf)
     arms: list[Arm] = []
@@ -69,7 +65,7 @@ def complete_arms(draft: RobotDraft, urdf: Urdf, source: str) -> tuple[Arm, Arm]
 
 
 def fill_right_arm(arms: tuple[ArmDraft, ArmDraft]) -> tuple[ArmDraft, ArmDraft]:
-    """Both arms, the right one as the left where it is left open, but for its home and rest."""
+    """Both arms; a missing right arm is like the left, except for home and rest."""
     left, right = arms
     return (left, replace(left, home=None, rest=None)) if right == ArmDraft() else (left, right)
 
@@ -82,16 +78,16 @@ def _check_joints(urdf: Urdf, names: Sequence[str], source: str) -> None:
 
 
 def _find_link(urdf: Urdf, name: str, source: str) -> str:
-    """A link, or the child link of a joint, as RoboTwin names it."""
+    """A link by its name, or by the name of its joint as in RoboTwin."""
     if name in urdf.links:
         return name
     if name in urdf.joints:
         return urdf.joints[name].child
-    raise ConfigError(f"{source}: {urdf.path.name} has no link or joint {name}; name the one that carries the tool.")
+    raise ConfigError(f"{source}: {urdf.path.name} has no link or joint {name}; expected the tool's link.")
 
 
 def _clip_fingers(urdf: Urdf, fingers: tuple[str, str], positions: tuple[float, float]) -> tuple[float, float]:
-    """Finger positions within the URDF's limits: RoboTwin's scales reach beyond them, to press."""
+    """Finger positions within the URDF's limits, which RoboTwin's scales exceed."""
     first, second = (
         min(max(position, urdf.joints[name].lower), urdf.joints[name].upper)
         for name, position in zip(fingers, positions, strict=True)
@@ -108,7 +104,7 @@ def _check_arm(urdf: Urdf, arm: Arm, source: str) -> None:
         )
     length = float(np.linalg.norm(arm.tool_pose[3:]))
     if not (np.isfinite(arm.tool_pose).all() and np.isfinite(arm.root_pose).all() and abs(length - 1) < 1e-3):
-        raise ConfigError(f"{source}: tool_pose {arm.tool_pose} is no position and unit quaternion x y z w.")
+        raise ConfigError(f"{source}: tool_pose {arm.tool_pose} is invalid; expected a position and a unit quaternion x y z w.")
     chain = {joint.name for joint in urdf.chain(arm.tool_link)}
     if loose := [name for name in arm.joints if name not in chain]:
         raise ConfigError(f"{source}: {', '.join(loose)} do not lead to {arm.tool_link}; name the joints of this arm.")
@@ -117,7 +113,7 @@ def _check_arm(urdf: Urdf, arm: Arm, source: str) -> None:
 def complete_limits(
     draft: RobotDraft, urdf: Urdf, arms: tuple[Arm, Arm], source: str
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Lower and upper position limits [d] rad and speed limits [d] rad/s that experts keep."""
+    """Lower and upper position limits [d] rad and speed limits [d] rad/s of experts."""
     both = [joint_limits(urdf, arm.joints) for arm in arms]
     inferred = (np.maximum(both[0][0], both[1][0]), np.minimum(both[0][1], both[1][1]), np.minimum(both[0][2], both[1][2]))
     given = (draft.joint_lower, draft.joint_upper, draft.joint_velocity)
@@ -125,14 +121,14 @@ def complete_limits(
     if not len(lower) == len(upper) == len(speed) == len(arms[0].joints) or not (lower < upper).all() or not (speed > 0).all():
         raise ConfigError(
             f"{source}: joint_lower, joint_upper and joint_velocity need {len(arms[0].joints)} numbers each, lower below "
-            "upper and velocities above 0, for both arms. Arms whose limits mirror each other are made alike by "
-            "python -m xew.sim_warp.robots.adopt."
+            "upper and velocities above 0, for both arms. Use python -m xew.sim_warp.robots.adopt for arms with mirrored "
+            "limits."
         )
     return lower, upper, speed
 
 
 def check_own_motion(draft: RobotDraft, arms: tuple[Arm, Arm], lower: np.ndarray, upper: np.ndarray, source: str) -> None:
-    """Raise ConfigError for acceleration limits or rest postures that do not fit the arms [d] and their limits [d] rad."""
+    """Raise ConfigError for invalid acceleration limits or rest postures of arms with limits [d] rad."""
     given = np.array(draft.joint_acceleration if draft.joint_acceleration is not None else [1.0] * len(lower))
     if len(given) != len(lower) or not (given > 0).all():
         raise ConfigError(f"{source}: joint_acceleration is {given.tolist()}; expected {len(lower)} numbers above 0.")
@@ -145,7 +141,7 @@ def check_own_motion(draft: RobotDraft, arms: tuple[Arm, Arm], lower: np.ndarray
 
 
 def find_fingers(urdf: Urdf) -> list[tuple[str, str]]:
-    """The finger joints of every hand, the left hand first: two prismatic joints on one link, of robots that look along x.
+    """The finger joints of every hand, the left hand first: two prismatic joints on one link, for robots that face +x.
 
     Raises:
         ConfigError: there is no hand, or more than two.
@@ -157,9 +153,9 @@ def find_fingers(urdf: Urdf) -> list[tuple[str, str]]:
     hands = {hand: fingers for hand, fingers in by_hand.items() if len(fingers) == 2}
     if not 1 <= len(hands) <= 2:
         raise ConfigError(
-            f"{urdf.path}: found {len(hands)} hands (a link with two prismatic finger joints), expected one or two. Linked or "
-            f"turning fingers become such a hand by python -m xew.sim_warp.robots.adopt {urdf.path.name}, and a bare arm takes "
-            "one of ours by its --hand ur5_wsg; else name them in a robot.yaml as arms: [{fingers: [A, B]}, {fingers: [C, D]}]."
+            f"{urdf.path}: found {len(hands)} hands (a link with two prismatic finger joints), expected one or two. "
+            f"python -m xew.sim_warp.robots.adopt {urdf.path.name} converts linked or turning fingers, and its --hand ur5_wsg "
+            "mounts a hand; or name the joints in a robot.yaml as arms: [{fingers: [A, B]}, {fingers: [C, D]}]."
         )
     poses = pose_links(urdf)
     ordered = sorted(hands, key=lambda hand: -poses[hand][1, 3])
@@ -167,13 +163,13 @@ def find_fingers(urdf: Urdf) -> list[tuple[str, str]]:
 
 
 def arm_joints(urdf: Urdf, fingers: tuple[str, str]) -> tuple[str, ...]:
-    """The turning joints from the root to a hand. Raises ConfigError if they are not six or seven."""
+    """The turning joints from the root to a hand. Raises ConfigError unless there are six or seven."""
     turning = [joint.name for joint in urdf.chain(hand_link(urdf, fingers)) if joint.kind in ("revolute", "continuous")]
     if len(turning) not in ARM_JOINTS:
         raise ConfigError(
             f"{urdf.path}: {len(turning)} joints turn on the way to {hand_link(urdf, fingers)} ({', '.join(turning) or '-'}), "
-            "expected six or seven: all tasks lead the hand in position and in all of its turns, which five joints cannot. "
-            "Name those of the arm in a robot.yaml as arms: [{joints: [...]}, {joints: [...]}]."
+            "expected six or seven, for full poses of the hand. Name the joints "
+            "of the arm in a robot.yaml as arms: [{joints: [...]}, {joints: [...]}]."
         )
     return tuple(turning)
 
@@ -184,10 +180,10 @@ def hand_link(urdf: Urdf, fingers: tuple[str, str]) -> str:
 
 
 def finger_ends(urdf: Urdf, fingers: tuple[str, str]) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Positions (closed, open) of both finger joints [m]: closed is the end at which a finger is nearer to the other.
+    """Positions (closed, open) of both finger joints [m]; closed is the end nearer to the other finger.
 
     Raises:
-        ConfigError: a finger has no limits or no way to go.
+        ConfigError: a finger has no limits or no range.
     """
     middles = {name: _middle_position(urdf.joints[name], urdf) for name in fingers}
     closed, opened = [], []
@@ -202,7 +198,7 @@ def finger_ends(urdf: Urdf, fingers: tuple[str, str]) -> tuple[tuple[float, floa
 
 
 def _middle_position(joint: Joint, urdf: Urdf) -> float:
-    """The middle of a finger's way [m]. Raises ConfigError if it has none."""
+    """The middle of a finger's range [m]. Raises ConfigError if it has none."""
     if joint.kind != "prismatic" or not math.isfinite(joint.upper - joint.lower) or joint.upper - joint.lower < 1e-4:
         raise ConfigError(
             f"{urdf.path}: the finger {joint.name} is {joint.kind} from {joint.lower:g} to {joint.upper:g}; expected a "
@@ -212,7 +208,7 @@ def _middle_position(joint: Joint, urdf: Urdf) -> float:
 
 
 def _finger_points(urdf: Urdf, name: str, positions: dict[str, float]) -> np.ndarray:
-    """Points [k 3] m of all that a finger joint moves, in the frame of the hand."""
+    """Points [k 3] m of the links below a finger joint, in the frame of the hand."""
     poses = pose_links(urdf, positions)
     return moved_points(urdf, name, poses, poses[urdf.joints[name].parent])
 
@@ -224,11 +220,10 @@ def _closed_hand_points(urdf: Urdf, fingers: tuple[str, str], closed: tuple[floa
 
 
 def tool_frame(urdf: Urdf, joints: tuple[str, ...], fingers: tuple[str, str], closed: tuple[float, float]) -> Pose:
-    """The tool frame in the link that carries the fingers: x out of the hand, y along which the fingers open, origin between
-    the fingers, `TIP_MARGIN` behind their tips.
+    """The tool frame in the hand's link: x out of the hand, y opening direction, origin `TIP_MARGIN` behind the fingertips.
 
     Raises:
-        ConfigError: the fingers do not show which way the hand points.
+        ConfigError: the hand's direction is ambiguous.
     """
     hand = hand_link(urdf, fingers)
     opening = urdf.joints[fingers[0]].origin[:3, :3] @ urdf.joints[fingers[0]].axis
@@ -239,13 +234,13 @@ def tool_frame(urdf: Urdf, joints: tuple[str, ...], fingers: tuple[str, str], cl
     approach = (low + high) / 2 - wrist[:3, 3]
     approach -= opening * (approach @ opening)
     if np.linalg.norm(approach) < 1e-3:
-        raise ConfigError(f"{urdf.path}: it is ambiguous which way {hand} points; give tool_pose in a robot.yaml.")
+        raise ConfigError(f"{urdf.path}: the direction of {hand} is ambiguous; set tool_pose in a robot.yaml.")
     approach = _snap_to_axis(approach / np.linalg.norm(approach), opening)
     return tool_at_tips(urdf, hand, np.stack([approach, opening, np.cross(approach, opening)], axis=1), fingers, closed)
 
 
 def tool_at_tips(urdf: Urdf, link: str, rotation: np.ndarray, fingers: tuple[str, str], closed: tuple[float, float]) -> Pose:
-    """A tool frame in `link` of the orientation `rotation` [3 3], its origin between the fingers, behind their tips."""
+    """A tool frame in `link` with the orientation `rotation` [3 3], its origin between the fingers, behind their tips."""
     poses = pose_links(urdf)
     hand = np.linalg.inv(poses[link]) @ poses[hand_link(urdf, fingers)]
     points = (_closed_hand_points(urdf, fingers, closed) @ hand[:3, :3].T + hand[:3, 3]) @ rotation
@@ -255,13 +250,13 @@ def tool_at_tips(urdf: Urdf, link: str, rotation: np.ndarray, fingers: tuple[str
 
 
 def _snap_to_axis(direction: np.ndarray, opening: np.ndarray) -> np.ndarray:
-    """The nearest axis of the hand that is square to `opening`, if it is near, else the direction itself."""
+    """The nearest axis of the hand, if it is near and orthogonal to `opening`, else the direction."""
     axis = nearest_axis(direction)
     return axis if axis @ direction > SNAP and abs(axis @ opening) < 1e-6 else direction
 
 
 def joint_limits(urdf: Urdf, joints: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Lower and upper position limits [d] rad and speed limits [d] rad/s that experts keep.
+    """Lower and upper position limits [d] rad and speed limits [d] rad/s of experts.
 
     Raises:
         ConfigError: a joint does not turn, or has no limits.

@@ -1,10 +1,7 @@
-"""Users' robots: from a path to a `RobotSpec`, and copies of them in the data sets that were generated with them.
+"""Users' robots: from a path to a `RobotSpec`, and their copies in data sets.
 
-Reads  a URDF, a folder with robot.yaml, a RoboTwin embodiment folder, or a robot of a data set
-Writes <data>/robots/<key>/: a complete robot.yaml, the URDF and all files that it names
-
-Episodes name their robot by its key. Whoever reads them finds the robot in the data set of the episode, or in the folders that
-`XEW_ROBOTS` lists (as PATH does).
+A copy is <data>/robots/<key>/ with a complete robot.yaml, the URDF and all files that it names. Episodes name their robot by
+its key; it is searched in their data set, then in the folders of `XEW_ROBOTS`.
 """
 
 import contextlib
@@ -37,27 +34,25 @@ FOLDERS = "XEW_ROBOTS"
 KEPT = "robots"
 """Name of the folder of a data set that holds its robots."""
 FILES = "files"
-"""Folder of a robot's folder with copies of all files that its URDF names."""
+"""Subfolder with copies of all files that the URDF names."""
 DESCRIPTIONS = Path(__file__).resolve().parents[1] / "descriptions"
 """Folder of the package's own URDFs and meshes."""
 SEARCH_CODE = ("robots/user", "kinematics", "tasks", "assets", "embodiment", "geometry")
-"""Packages of sim_warp whose code, with the files at its root, decides where a robot is placed: a change of it invalidates
-cached places."""
+"""Packages of sim_warp whose code, with the files at its root, determines a robot's place; changes invalidate cached places."""
 
 
 def is_path(name: str) -> bool:
-    """Is a robot named by where it lies, and not by a key or module:NAME?"""
+    """Whether the name of a robot is a path, not a key or module:NAME."""
     return os.sep in name or name in (".", "..") or name.endswith((".urdf", ".xacro", ".yaml", ".yml"))
 
 
 def load_robot(path: Path | str) -> RobotSpec:
-    """The robot at a path; what it leaves open is found from the URDF and by inverse kinematics.
+    """The robot at a path: a .urdf, a robot.yaml, a RoboTwin config.yml, or a folder with one of them.
 
-    Args:
-        path: a .urdf, a robot.yaml, a RoboTwin config.yml, or a folder with one of them.
+    Missing entries are inferred from the URDF and by inverse kinematics.
 
     Raises:
-        ConfigError: there is no robot, it cannot be read, or it cannot do what every robot must.
+        ConfigError: there is no robot, it cannot be read, or it does not meet the requirements of all robots.
     """
     description = find_description(Path(path)).resolve()
     return _load(description, description.stat().st_mtime_ns)
@@ -70,16 +65,16 @@ def _load(description: Path, modified: int) -> RobotSpec:
 
 
 def robot_key(description: Path) -> str:
-    """A name for folders, of a URDF file or else the folder; `_own` distinguishes it from the robots and bodies of xew."""
+    """The key of a robot: the name of its URDF file or folder; `_own` distinguishes it from xew's robots and bodies."""
     name = description.stem if description.suffix == ".urdf" else description.parent.name
     key = re.sub(r"[^A-Za-z0-9_-]+", "_", name).strip("_-")
     if not key:
-        raise ConfigError(f"{description}: the name {name!r} gives no key for the robot; give the folder a name of letters.")
+        raise ConfigError(f"{description}: the name {name!r} is no valid key; expected a folder name with letters or digits.")
     taken = key in ROBOT_NAMES or BODY_NAME.fullmatch(key)
     return f"{key}_own" if taken else key
 
 
-# --- What a draft leaves open.
+# --- Completion of drafts.
 
 
 def complete_draft(draft: RobotDraft, urdf: Urdf, key: str, source: str) -> RobotSpec:
@@ -88,8 +83,8 @@ def complete_draft(draft: RobotDraft, urdf: Urdf, key: str, source: str) -> Robo
     counts = [len(arm.joints) for arm in arms]
     if counts[0] != counts[1] or counts[0] not in (6, 7):
         raise ConfigError(
-            f"{source}: the arms have {counts[0]} and {counts[1]} joints; expected equal arms of six or seven, for all "
-            "tasks lead the hand in position and in all of its turns."
+            f"{source}: the arms have {counts[0]} and {counts[1]} joints; expected equal arms of six or seven, for full poses "
+            "of the hand."
         )
     lower, upper, speed = complete_limits(draft, urdf, arms, source)
     check_own_motion(draft, arms, lower, upper, source)
@@ -107,7 +102,7 @@ def complete_draft(draft: RobotDraft, urdf: Urdf, key: str, source: str) -> Robo
 
 
 def _settle(draft: RobotDraft, robot: RobotSpec, source: str) -> RobotSpec:
-    """The robot with bases and homes, which are found where the draft leaves them open."""
+    """The robot with bases and homes; missing ones are searched."""
     left, right = fill_right_arm(draft.arms)
     if left.root_pose is not None and left.home is not None and right.home is not None:
         return robot
@@ -135,7 +130,7 @@ def _find_place(draft: RobotDraft, robot: RobotSpec, near: Near) -> RobotSpec:
 
 
 def _place_digest(draft: RobotDraft, robot: RobotSpec) -> str:
-    """SHA-256 over all that a place depends on: the draft, the files of the URDF, and the code that searches."""
+    """SHA-256 over all inputs of a place: the draft, the files of the URDF, and the code of the search."""
     digest = hashlib.sha256(repr((draft, replace(robot, urdf=Path()))).encode())
     package = Path(__file__).parents[2]
     code = {*package.glob("*.py"), *(file for folder in SEARCH_CODE for file in (package / folder).rglob("*.py"))}
@@ -145,7 +140,7 @@ def _place_digest(draft: RobotDraft, robot: RobotSpec) -> str:
 
 
 def _read_place(path: Path, robot: RobotSpec) -> RobotSpec | None:
-    """The robot with the cached bases, homes and tool frames; None if there are none."""
+    """The robot with its cached bases, homes and tool frames, or None."""
     try:
         left, right = (
             replace(arm, root_pose=tuple(place["root_pose"]), home=tuple(place["home"]), tool_pose=tuple(place["tool_pose"]))
@@ -157,26 +152,25 @@ def _read_place(path: Path, robot: RobotSpec) -> RobotSpec | None:
 
 
 def _keep_place(robot: RobotSpec, path: Path) -> None:
-    """Cache bases, homes and tool frames, where the cache folder can be written."""
-    places = [{name: getattr(arm, name) for name in ("root_pose", "home", "tool_pose")} for arm in robot.arms]
+    """Cache bases, homes and tool frames, if the cache folder can be written."""
+    arms = [{name: getattr(arm, name) for name in ("root_pose", "home", "tool_pose")} for arm in robot.arms]
     with contextlib.suppress(OSError), replacing(path) as temporary:
-        temporary.write_text(json.dumps(places), encoding="utf-8")
+        temporary.write_text(json.dumps(arms), encoding="utf-8")
 
 
 def _posture(arm: ArmDraft, robot: RobotSpec, source: str) -> np.ndarray | None:
-    """Posture [d] rad to look for a home from, if the draft has one. Raises ConfigError if it does not fit the arm."""
+    """Start posture [d] rad for the search of a home, if given. Raises ConfigError if it does not fit the arm."""
     near = arm.home or arm.near
     if near is not None and len(near) != robot.arm_joint_count:
-        raise ConfigError(f"{source}: a home has {len(near)} joints, the arm {robot.arm_joint_count}; expected as many.")
+        raise ConfigError(f"{source}: a home has {len(near)} joints; expected {robot.arm_joint_count}, as many as the arm.")
     return None if near is None else np.array(near)
 
 
-# --- Kept beside the data.
+# --- Copies in data sets.
 
 
 def adopt_robots(names: Sequence[str], data: Path) -> tuple[str, ...]:
-    """Robots as jobs name them: paths become keys, and what lies there is kept in `<data>/robots/<key>`; `body:0-7` becomes the
-    keys of eight bodies.
+    """Keys of robots; robots at paths are copied to `<data>/robots/<key>`, and `body:0-7` becomes eight keys.
 
     Raises:
         ConfigError: a robot cannot be used, or the data set holds another of that key.
@@ -185,7 +179,7 @@ def adopt_robots(names: Sequence[str], data: Path) -> tuple[str, ...]:
 
 
 def kept_robot(key: str, data: Path | None = None) -> RobotSpec | None:
-    """The robot of a key in a data set, or else in a folder of `XEW_ROBOTS`; None where neither has it."""
+    """The robot of a key in a data set, or else in a folder of `XEW_ROBOTS`, or None."""
     if data is not None and (description := Path(data) / KEPT / key / OWN).is_file():
         try:
             check_name(key, "robot")
@@ -201,7 +195,7 @@ def kept_robot(key: str, data: Path | None = None) -> RobotSpec | None:
 
 @lru_cache(maxsize=256)
 def _demand_own_files(description: Path, modified: int) -> None:
-    """Raise EpisodeError where a data set's robot is read from files outside of its folder: data sets may be anybody's."""
+    """Raise EpisodeError if a data set's robot refers to files outside its folder."""
     folder = description.parent
     path_below(folder.parent, folder.name)
     urdf = path_below(folder, read_draft(path_below(folder, description.name)).urdf)
@@ -211,7 +205,7 @@ def _demand_own_files(description: Path, modified: int) -> None:
         raise EpisodeError(f"{urdf} cannot be read as a URDF ({error}); copy the data set again.") from error
     for name in filter(None, named):
         path_below(folder, str(urdf.parent.relative_to(folder) / name))
-    for file in load_urdf(urdf).files:  # what meshes name in turn
+    for file in load_urdf(urdf).files:  # materials and textures of meshes
         if not file.resolve().is_relative_to(folder.resolve()):
             raise EpisodeError(f"{description} reads {file}, which is not below its folder; copy the data set again.")
 
@@ -223,8 +217,8 @@ def _adopt(path: Path, data: Path) -> str:
     if copy.is_file():
         if read_draft(copy).source != digest:
             raise ConfigError(
-                f"{copy.parent} holds another robot of that name than {path}, or that one before it changed; rename the "
-                "folder or file, or choose another --out."
+                f"{copy.parent} holds another robot of that name, or an earlier version of {path}; rename the folder or file, "
+                "or choose another --out."
             )
         return key
     print(f"robot {key}: completing {description.name}; the result is written to {copy}")
@@ -233,7 +227,7 @@ def _adopt(path: Path, data: Path) -> str:
 
 
 def _digest(description: Path) -> str:
-    """SHA-256 over the description and all files that its URDF is read from."""
+    """SHA-256 over the description and all files of its URDF."""
     urdf = load_urdf(description.parent / read_draft(description).urdf)
     digest = hashlib.sha256(description.read_bytes())
     for file in urdf.files:
@@ -242,11 +236,7 @@ def _digest(description: Path) -> str:
 
 
 def keep_robot(robot: RobotSpec, data: Path, digest: str = "") -> RobotSpec:
-    """Copy a robot into a data set, under its key, unless there is one already; returns the data set's robot.
-
-    Args:
-        digest: SHA-256 of the description that the robot comes from, by which it is recognized.
-    """
+    """Copy a robot, with the SHA-256 of its description, into a data set unless it has the key; returns the copy."""
     folder = path_below(data, KEPT, robot.key)
     if not (folder / OWN).is_file():
         write_robot(robot, folder, _robot_yaml(robot, digest))
@@ -254,10 +244,10 @@ def keep_robot(robot: RobotSpec, data: Path, digest: str = "") -> RobotSpec:
 
 
 def write_robot(robot: RobotSpec, folder: Path, description: str) -> None:
-    """Write a robot's folder: `description` as robot.yaml, the URDF as <key>.urdf, and all files that it names below files/.
+    """Write a robot's folder: `description` as robot.yaml, the URDF as <key>.urdf, and all files that it names in files/.
 
     Raises:
-        EpisodeError: the folder holds something else.
+        EpisodeError: the folder holds other files.
     """
     urdf, name = load_urdf(robot.urdf), urdf_name(robot)
     copies = _copy_names(urdf.files[1:])
@@ -280,7 +270,7 @@ def urdf_name(robot: RobotSpec) -> str:
 
 
 def _copy_names(files: Sequence[Path]) -> dict[Path, Path]:
-    """Path of each file's copy in a robot's folder; files keep their places relative to one another."""
+    """Path of each file's copy in a robot's folder, with unchanged relative paths."""
     own = [file.resolve() for file in files if not file.resolve().is_relative_to(DESCRIPTIONS)]
     top = Path(os.path.commonpath([file.parent for file in own])) if own else Path("/")
     copies = {file: Path(FILES) / file.relative_to(top) for file in own}
@@ -289,7 +279,7 @@ def _copy_names(files: Sequence[Path]) -> dict[Path, Path]:
 
 
 def _robot_yaml(robot: RobotSpec, digest: str) -> str:
-    """A robot.yaml that leaves nothing open."""
+    """A complete robot.yaml."""
     limits = {
         name: list(getattr(robot, name)) for name in ("joint_lower", "joint_upper", "joint_velocity", "joint_acceleration")
     }

@@ -1,11 +1,7 @@
-"""Placement of robots: where they stand and how they hold their arms at rest, found by inverse kinematics.
+"""Placement of robots: bases and homes with both tools at `plan.HOME`, by inverse kinematics.
 
-Reads  a RobotSpec whose bases or homes are not decided yet
-Writes the same robot with both tools at `plan.HOME`, so that every task's plan begins where the robot is
-
-Every place that is tried goes through three steps, each for fewer places than the one before: homes of both arms, the share of
-the work area that they reach, and plans of tasks with both arms. Searched on the CPU with a fixed seed: the same robot gets
-the same place and posture every time.
+Candidates are filtered in three steps: homes of both arms, the share of the work area within reach, and plans of tasks with
+both arms. The search runs on the CPU with a fixed seed and is deterministic.
 """
 
 from collections.abc import Iterable, Sequence
@@ -23,32 +19,31 @@ from xew.sim_warp.robots.user.draft import Near
 from xew.sim_warp.robots.user.trials import Postures, Trials, trial_plans
 
 DISTANCES = (0.6, 0.7, 0.8, 0.5, 0.4)
-"""Distances between the bases of two equal arms [m], in the order of preference; RoboTwin calls 0.6 to 0.8 typical."""
+"""Distances between the bases of two equal arms [m], in order of preference; in RoboTwin 0.6 to 0.8 are typical."""
 PLACE_DISTANCES, BASE_Y, BASE_Z = (0.6, 0.4, 0.7), (-0.45, -0.55, -0.65, -0.37), (0.75, 0.55)
 ROOT_Z = (0.0, 0.25, 0.5, 0.75)
-"""Places that are tried where a robot names none [m]: the four before for two equal arms, this height for one root of both
-arms."""
+"""Default candidate places [m]: the values above for two equal arms, this height for one root of both arms."""
 YAW_90 = (0.0, 0.0, 0.5**0.5, 0.5**0.5)
-"""Quaternion x y z w of a root that looks to +y, for robots that look along their x."""
+"""Quaternion x y z w of a root that faces +y, for robots that face along their x."""
 SEEDS, MANY_SEEDS = 20, 64
-"""Numbers of postures from which the search for a home begins: of many places, and of few."""
+"""Numbers of start postures for the search of a home, for many places and for few."""
 FEW, SEVERAL = 3, 8
-"""Numbers of postures of an arm that are compared, of many places and of few."""
+"""Numbers of compared postures per arm, for many places and for few."""
 FEW_PLACES = 8
-"""Number of places up to which they count as few."""
+"""Largest number of places that counts as few."""
 BEST_PLACES, BEST_POSTURES = 4, 2
-"""Numbers of places, and of postures of each arm, with which plans are tried."""
+"""Numbers of places, and of postures per arm, for trials of plans."""
 FINALISTS = 4
-"""Largest number of places with homes from which plans are followed frame by frame; the first that follows all is taken."""
+"""Largest number of places with homes for complete plans; the first that follows all plans is chosen."""
 
 
 @dataclass(frozen=True)
 class Placed:
-    """A robot with a place and homes, and how well it does there."""
+    """A robot with a place and homes, and the results of its plans."""
 
     robot: RobotSpec
     problems: tuple[str | None, ...]
-    """For each of `trials.trial_plans` why the robot cannot follow it, None where it can."""
+    """For each of `trials.trial_plans` the reason why the robot cannot follow it, None if it can."""
 
     @property
     def share(self) -> float:
@@ -57,14 +52,10 @@ class Placed:
 
 
 def place(candidates: Sequence[RobotSpec], near: Near = (None, None)) -> Placed:
-    """The candidate that follows the most plans, with homes; of equals the first.
-
-    Args:
-        candidates: one robot at the places that are tried.
-        near: posture [d] rad that each arm would like to be near, or None.
+    """The candidate place of one robot that follows the most plans, with homes near preferred postures; of equals the first.
 
     Raises:
-        ConfigError: no candidate brings both tools home, or only with a link in the table; says by how much.
+        ConfigError: no candidate brings both tools home without a collision with the table.
     """
     few = len(candidates) <= FEW_PLACES
     trials = Trials(candidates)
@@ -86,18 +77,12 @@ def place(candidates: Sequence[RobotSpec], near: Near = (None, None)) -> Placed:
 
 
 def check_plans(robot: RobotSpec) -> Placed:
-    """Let the expert follow a few tasks' plans with a robot that has its place and homes."""
+    """Follow a few tasks' plans with a complete robot."""
     return Placed(robot, tuple(commands.problem for commands in joint_commands(robot, list(trial_plans()))))
 
 
 def place_at(robot: RobotSpec, candidates: Sequence[RobotSpec], near: Near) -> Placed:
-    """As `place`, for a robot whose user says where it stands; an error names a place that would do.
-
-    Args:
-        robot: at the place that the user names.
-        candidates: the robot as it is, or with its bases apart by the distances that may be tried.
-        near: posture [d] rad that each arm would like to be near, or None.
-    """
+    """As `place`, for a robot at a given place, or at it with several base distances; an error suggests another place."""
     try:
         return place(candidates, near)
     except ConfigError as error:
@@ -106,11 +91,11 @@ def place_at(robot: RobotSpec, candidates: Sequence[RobotSpec], near: Near) -> P
         except ConfigError:
             raise error from None
         roots = " and ".join(_format_position(np.array(arm.root_pose[:3])) for arm in other.arms)
-        raise ConfigError(f"{error} From root_pose {roots} m, looking to +y, both arms reach home.") from None
+        raise ConfigError(f"{error} From root_pose {roots} m, facing +y, both arms reach home.") from None
 
 
 def standard_places(robot: RobotSpec) -> list[RobotSpec]:
-    """The robot at every place that is tried where it names none."""
+    """The robot at all default candidate places."""
     if robot.one_urdf_holds_both_arms:
         return [move_to(robot, (0.0, y, z, *YAW_90)) for y, z in product(BASE_Y, ROOT_Z)]
     places = product(PLACE_DISTANCES, BASE_Y, BASE_Z)
@@ -134,19 +119,19 @@ def move_apart(robot: RobotSpec, gap: float) -> RobotSpec:
 
 
 def with_turned_tools(candidates: Iterable[RobotSpec]) -> list[RobotSpec]:
-    """The candidates, then the same with their tool frames turned by half about the approach, which is the same to fingers."""
+    """The candidates, then the same with their tool frames turned by 180 degrees about the approach, an equivalent grasp."""
     half = Rotation.from_euler("x", np.pi)
 
     def turn(arm: Arm) -> Arm:
         rotation = (Rotation.from_quat(arm.tool_pose[3:]) * half).as_quat(canonical=True)
         return replace(arm, tool_pose=(*arm.tool_pose[:3], *rotation.tolist()))
 
-    as_they_are = list(candidates)
-    return as_they_are + [replace(robot, arms=(turn(robot.arms[0]), turn(robot.arms[1]))) for robot in as_they_are]
+    robots = list(candidates)
+    return robots + [replace(robot, arms=(turn(robot.arms[0]), turn(robot.arms[1]))) for robot in robots]
 
 
 def _rank_by_reach(trials: Trials, homes: Postures) -> Postures:
-    """The best postures of the places whose worse arm reaches most."""
+    """The best postures of the places with the largest reach of the worse arm."""
     shares = trials.reached_shares(homes)
     best = np.array(
         [
@@ -163,8 +148,10 @@ def _rank_by_reach(trials: Trials, homes: Postures) -> Postures:
 
 
 def _rank_by_plans(trials: Trials, homes: Postures) -> list[RobotSpec]:
-    """The places with pairs of homes, those from which both arms follow most plans first; of equals those in which the arms are
-    most alike, for a seven-joint arm is drawn to the mean of both."""
+    """The places with pairs of homes, by decreasing number of plans that both arms follow, then by similarity of the arms.
+
+    Seven-joint arms are pulled toward the mean of both homes.
+    """
     follows = trials.follow_plans(homes)
     ranked: list[tuple[int, float, int, int]] = []
     for number in dict.fromkeys(homes.candidate.tolist()):

@@ -1,8 +1,4 @@
-"""Normalization of robot descriptions: a URDF or xacro becomes one URDF tree in the form that `infer` reads.
-
-Reads  a URDF or xacro with the folders of its packages and its arguments
-Writes the URDF's tree with every file named absolutely; `hands` and `unfold_mirrored` change it further
-"""
+"""Normalization of robot descriptions: a URDF or xacro becomes one URDF tree with absolute file names."""
 
 import re
 import xml.etree.ElementTree as ElementTree
@@ -15,16 +11,11 @@ from xew.config import ConfigError
 from xew.files import read_text
 from xew.sim_warp.embodiment.urdf import Urdf
 
-NO_XACRO = "is a xacro, which xacrodoc expands: python -m pip install xacrodoc. Or give the URDF that it stands for."
+NO_XACRO = "is a xacro and needs xacrodoc: python -m pip install xacrodoc. Or pass the expanded URDF."
 
 
 def read_description(path: Path, packages: Mapping[str, Path], arguments: Mapping[str, str]) -> ElementTree.Element:
-    """The tree of a URDF or xacro, with the files that it names found where they lie.
-
-    Args:
-        path: .urdf or .xacro.
-        packages: folders of packages, by the name that follows `package://` or that a xacro finds.
-        arguments: of a xacro.
+    """The tree of a .urdf or .xacro with absolute file names, with the folders of packages and a xacro's arguments by name.
 
     Raises:
         ConfigError: it cannot be read, or a folder does not exist.
@@ -35,14 +26,14 @@ def read_description(path: Path, packages: Mapping[str, Path], arguments: Mappin
     try:
         tree = ElementTree.fromstring(text)
     except ElementTree.ParseError as error:
-        raise ConfigError(f"{path} is not a URDF that can be read ({error}); mend its XML.") from error
+        raise ConfigError(f"{path} is not a URDF that can be read ({error}); fix its XML.") from error
     for entry in [*tree.iter("mesh"), *tree.iter("texture")]:
         entry.set("filename", _absolute(entry.get("filename", ""), path.parent, packages))
     return tree
 
 
 def _expand(path: Path, packages: Mapping[str, Path], arguments: Mapping[str, str]) -> str:
-    """The text of the URDF that a xacro stands for."""
+    """The expanded text of a xacro."""
     try:
         from xacrodoc import XacroDoc
         from xacrodoc import packages as finder
@@ -52,14 +43,14 @@ def _expand(path: Path, packages: Mapping[str, Path], arguments: Mapping[str, st
     try:
         document = XacroDoc.from_file(str(path), subargs=dict(arguments), resolve_packages=False)
         return str(document.to_urdf_string())
-    except Exception as error:  # xacro and xacrodoc have many of their own
+    except Exception as error:  # xacro and xacrodoc raise many kinds
         reason = " ".join(str(error).split()) or type(error).__name__
-        advice = "--package NAME=DIR and --argument NAME=VALUE help"
+        advice = "check --package NAME=DIR and --argument NAME=VALUE"
         raise ConfigError(f"{path} cannot be expanded ({reason}); {advice}.") from error
 
 
 def _absolute(name: str, folder: Path, packages: Mapping[str, Path]) -> str:
-    """The name of a file with the folder of its package, or of the description, before it, where the file lies there."""
+    """The absolute name of a file in its package or next to the description; other names are unchanged."""
     if (inside := re.fullmatch(r"package://([^/]+)/(.*)", name)) and inside[1] in packages:
         return str((packages[inside[1]] / inside[2]).resolve())
     local = folder / name.removeprefix("file://")
@@ -67,24 +58,16 @@ def _absolute(name: str, folder: Path, packages: Mapping[str, Path]) -> str:
 
 
 def unfold_mirrored(tree: ElementTree.Element, pairs: list[tuple[str, str]], urdf: Urdf) -> list[str]:
-    """Turn the axes of right arms' joints about whose limits are those of the left ones with the sign changed.
+    """Reverse the axes of right joints in the tree whose limits mirror the left ones': both arms then have equal limits.
 
-    Both arms then have the same limits, as the two arms of a `RobotSpec` do; where their links lie may still be mirrored.
-
-    Args:
-        tree: is changed.
-        pairs: names of joints of the left and of the right arm, from the base outward.
-        urdf: the same tree as read.
-
-    Returns:
-        The names of the joints that were turned about.
+    `pairs` are names of left and right joints, from the base outward. Returns the names of the reversed joints.
     """
     turned = []
     for left, right in pairs:
         one, two = urdf.joints[left], urdf.joints[right]
-        as_they_are = abs(one.lower - two.lower) + abs(one.upper - two.upper)
+        equal = abs(one.lower - two.lower) + abs(one.upper - two.upper)
         mirrored = abs(one.lower + two.upper) + abs(one.upper + two.lower)
-        if np.isfinite([as_they_are, mirrored]).all() and mirrored < as_they_are - 1e-6:
+        if np.isfinite([equal, mirrored]).all() and mirrored < equal - 1e-6:
             _turn_about(next(joint for joint in tree.findall("joint") if joint.get("name") == right))
             turned.append(right)
     return turned

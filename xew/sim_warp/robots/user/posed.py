@@ -15,16 +15,9 @@ def pose_links(urdf: Urdf, positions: Mapping[str, float] | None = None) -> dict
 
 
 def moved_points(urdf: Urdf, joint: str, poses: Mapping[str, np.ndarray], frame: np.ndarray) -> np.ndarray:
-    """Points of all that a joint moves: corners of collision shapes, or vertices of links that have none.
+    """Points [k 3] m of the links that a joint moves, in a frame [4 4], which is like `poses` [4 4] in the root's frame.
 
-    Args:
-        urdf: the robot.
-        joint: name of the joint.
-        poses: [4 4] of all links in the root's frame (`pose_links`).
-        frame: [4 4] in the root's frame, in which the points are given.
-
-    Returns:
-        [k 3] m; the origin of the joint's child where it moves no shape.
+    They are corners of collision shapes, or vertices of links without any; without shapes the origin of the joint's child.
     """
     to_frame, clouds = np.linalg.inv(frame), []
     for link in urdf.moved_links(joint):

@@ -1,8 +1,4 @@
-"""Summary of a completed robot: what its arms can do where it stands, and what looks wrong.
-
-Reads  a complete RobotSpec and the plans that it follows
-Writes lines for a terminal, and a robot.yaml that marks every entry as given or found
-"""
+"""Summary of a completed robot: its properties, warnings, and a robot.yaml that marks every entry as given or found."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, fields
@@ -18,15 +14,15 @@ from xew.sim_warp.robots.user.infer import fill_right_arm
 from xew.sim_warp.robots.user.posed import moved_points, pose_links
 
 TIP = 0.02
-"""Length behind the tool frame's origin that counts as the fingers' tips [m]."""
+"""Length of the fingertips behind the tool frame's origin [m]."""
 SMALL_OPENING = 0.04
-"""Opening of a hand below which most things that tasks hold do not fit into it [m]."""
+"""Opening of a hand below which most objects do not fit [m]."""
 LARGEST_GAP = 0.004
-"""Distance between closed fingers from which they cannot hold the walls of cups and bowls [m]."""
+"""Distance between closed fingers at which they cannot hold the walls of cups and bowls [m]."""
 FAR_LINK = 2.5
-"""Distance from the root at which a link is taken for misplaced [m]."""
+"""Distance from the root at which a link is probably misplaced [m]."""
 PLACEHOLDER_SPEED = 1.0
-"""Speed limit that files of joints without a known one often have [rad/s]."""
+"""Usual placeholder for unknown speed limits [rad/s]."""
 FOUND = {
     "root_pose": "root link: x y z [m], quaternion x y z w; the place from which both arms follow most plans",
     "joints": "the turning joints on the way to the hand",
@@ -36,28 +32,22 @@ FOUND = {
     "fingers": "two joints that slide on one link",
     "finger_closed": "the end at which the fingers are nearer to each other [m]",
     "finger_open": "the other end [m]",
-    "rest": "where motion of its own begins [rad]; empty: home",
+    "rest": "initial posture of own motion [rad]; empty: home",
     "joint_lower": "the URDF's, within a whole turn [rad]",
     "joint_upper": "the same",
     "joint_velocity": "the URDF's; 3 where it has none, 0 or more than 10 [rad/s]",
     "joint_acceleration": "15 where nothing is known [rad/s^2]",
     "title": "the URDF's name",
 }
-"""Of each entry of a robot.yaml what it is and how it is found where it is not given."""
+"""Meaning of each entry of a robot.yaml and how a missing one is found."""
 HEAD = """\
-# What is known of this robot. "found" was inferred or searched for: change it, or remove it to have it found again.
-# Lengths in meters, angles in radians. Look at the sheet of pictures beside this folder after each change.
+# Description of this robot. Entries marked "found" were inferred: change them, or remove them to infer them again.
+# Lengths in meters, angles in radians. Check the pictures next to this folder after each change.
 """
 
 
 def robot_lines(robot: RobotSpec, problems: Sequence[str | None], reach: Sequence[float]) -> list[str]:
-    """What the robot is and does, a line each.
-
-    Args:
-        robot: complete.
-        problems: for each of `trials.trial_plans` why the robot cannot follow it, None where it can.
-        reach: share of the work area's grasps that each arm reaches.
-    """
+    """Lines on a robot's properties, its problems with `trials.trial_plans`, and each arm's share of reachable grasps."""
     speeds = ", ".join(f"{speed:.3g}" for speed in robot.joint_velocity)
     lines = []
     for side, arm, share in zip(("left", "right"), robot.arms, reach, strict=True):
@@ -76,21 +66,19 @@ def robot_lines(robot: RobotSpec, problems: Sequence[str | None], reach: Sequenc
 
 
 def warning_lines(robot: RobotSpec) -> list[str]:
-    """What looks wrong, a sentence each."""
+    """Warnings, one sentence each."""
     urdf = load_urdf(robot.urdf)
     warnings = list(urdf.notes)
     if {urdf.joints[name].velocity for arm in robot.arms for name in arm.joints} == {PLACEHOLDER_SPEED}:
-        warnings.append(
-            "all joints have a speed limit of 1 rad/s, which looks like a placeholder: give joint_velocity in robot.yaml"
-        )
+        warnings.append("all joints have a speed limit of 1 rad/s, probably a placeholder: set joint_velocity in robot.yaml")
     for side, arm in zip(("left", "right"), robot.arms, strict=True):
         if opening(arm) < SMALL_OPENING:
-            warnings.append(f"the {side} hand opens {1000 * opening(arm):.0f} mm; tasks hold things of up to 70 mm")
+            warnings.append(f"the {side} hand opens {1000 * opening(arm):.0f} mm; tasks have objects of up to 70 mm")
         if (gap := closed_gap(urdf, arm)) > LARGEST_GAP:
             apart = f"closed, the fingers of the {side} hand are {1000 * gap:.0f} mm apart"
-            warnings.append(f"{apart}: what is thinner cannot be held")
+            warnings.append(f"{apart}: thinner objects cannot be held")
         warnings += [
-            f"nothing that {name} moves has a collision shape: the {side} hand can hold nothing"
+            f"no link that {name} moves has a collision shape: the {side} hand cannot hold objects"
             for name in arm.fingers
             if not any(link.collisions for link in urdf.moved_links(name))
         ]
@@ -98,12 +86,12 @@ def warning_lines(robot: RobotSpec) -> list[str]:
         if (visual := urdf.links[name].visual) is not None:
             center = pose[:3, :3] @ visual.vertices.mean(0) + pose[:3, 3]
             if (away := float(np.linalg.norm(center))) > FAR_LINK:
-                warnings.append(f"link {name} is {away:.1f} m away from the root: look at its joint's origin and its mesh")
+                warnings.append(f"link {name} is {away:.1f} m away from the root: check its joint's origin and its mesh")
     return list(dict.fromkeys(warnings))
 
 
 def closed_gap(urdf: Urdf, arm: Arm) -> float:
-    """Distance of the fingers' tips along the axis on which they open, when they are closed [m]; below 0 where they overlap."""
+    """Distance of the closed fingertips along their opening axis [m], negative if they overlap."""
     poses = pose_links(urdf, dict(zip(arm.fingers, arm.finger_closed, strict=True)))
     tool = poses[arm.tool_link] @ matrix_from_pose(arm.tool_pose)
     clouds = [moved_points(urdf, name, poses, tool) for name in arm.fingers]
@@ -113,18 +101,12 @@ def closed_gap(urdf: Urdf, arm: Arm) -> float:
 
 
 def opening(arm: Arm) -> float:
-    """Way between the fingers from closed to open [m]."""
+    """Total travel of the fingers from closed to open [m]."""
     return float(np.abs(np.subtract(arm.finger_open, arm.finger_closed)).sum())
 
 
 def commented_yaml(robot: RobotSpec, draft: RobotDraft, urdf: str) -> str:
-    """A robot.yaml that leaves nothing open and says of each entry whether it was given or found.
-
-    Args:
-        robot: complete.
-        draft: what was given.
-        urdf: path of the URDF, relative to the robot.yaml.
-    """
+    """A complete robot.yaml that marks each entry as given in the draft or found; `urdf` is the URDF's relative path."""
     lines = [f"urdf: {_plain(urdf)}", _entry("title", robot.title, draft.title), "arms:"]
     for arm, given in zip(robot.arms, fill_right_arm(draft.arms), strict=True):
         entries = [_entry(name, value, _given(given, name)) for name, value in asdict(arm).items()]

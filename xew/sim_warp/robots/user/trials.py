@@ -1,9 +1,6 @@
-"""Trials of places for a robot: which postures bring its tools home from each, and what its arms reach from there.
+"""Trials of candidate places for a robot: homes, the share of the work area within reach, and plans of tasks.
 
-Reads  candidates: one robot at many places, whose arms differ by their bases and tool frames alone
-Writes postures at rest, the share of the work area that each reaches, and the plans of tasks that each follows
-
-All candidates go through the solver in the same calls: a call costs 15 ms however few poses it has, and 0.1 ms a pose.
+Candidates differ only by their bases and tool frames. They share the calls of the solver, which take 15 ms and 0.1 ms per pose.
 """
 
 from collections.abc import Sequence
@@ -37,34 +34,34 @@ PLAN_TASKS = (
     "open_laptop",
     "place_a2b_left",
 )
-"""Tasks whose plans places are compared by: with one hand and with two, lifting, striking, turning, placing."""
+"""Tasks of the trial plans: with one hand and with two, lifting, striking, turning, placing."""
 PLAN_SEEDS = 2
-"""Number of seeds of each of those tasks, from 0."""
+"""Number of seeds of each task, from 0."""
 ITERATIONS = 16
-"""Number of solver steps a call: every pose is sought from one nearby."""
+"""Number of solver steps per call."""
 POSITION_TOLERANCE, ROTATION_TOLERANCE = 1e-3, 0.01
 """Largest error of a home [m], [rad]."""
 REACH_POSITION, REACH_ROTATION = 3e-3, 0.03
-"""Largest error of a pose that counts as reached [m], [rad]: the expert's."""
-LIMIT_ROOM = 0.15
+"""Largest error of a reached pose [m], [rad], as for the expert."""
+LIMIT_MARGIN = 0.15
 """Least distance of a home from the joint limits, unless there is no other home [rad]."""
 CLEARANCE = 0.02
 """Least height of all moving links above the table, with the arms at home [m]."""
 HULL_POINTS = 64
-"""Largest number of points of a link that are held against the table."""
+"""Largest number of points per link for collisions with the table."""
 GRASP_OFFSETS, GRASP_X, GRASP_Y, GRASP_Z = (-45, 0, 45), (-0.3, -0.1, 0.1), (-0.2, 0.12), 0.8
-"""Grasps that are tried: turns of the yaw from the radial one [deg] and positions of the left hand [m]."""
+"""Trial grasps: yaw offsets from the radial yaw [deg] and positions of the left hand [m]."""
 PATH_STEPS = 4
 """Number of poses along the straight path from home to a grasp."""
 STRIDE = 8
-"""Number of frames from one pose of a plan that is tried to the next."""
+"""Number of frames between the tried poses of a plan."""
 SPEED_SHARE = 0.8
-"""Largest share of a joint's speed limit over a stride of a plan: within it the joint is faster now and then."""
+"""Largest share of a joint's speed limit over a stride of a plan, as a margin for peaks within it."""
 
 
 @dataclass(frozen=True)
 class Postures:
-    """Arms of candidates at rest, one a row."""
+    """Arms of candidates at rest, one per row."""
 
     candidate: np.ndarray
     """[e] int, number of the candidate."""
@@ -92,7 +89,7 @@ class Trials:
 
     def solve(self, rows: Postures, pose: np.ndarray, seed: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Joint positions [e k d] with position [e k] m and rotation errors [e k] rad for tool poses [e k 7], world, near
-        seeds [e k d]; the pose of row e is that of its candidate's arm."""
+        seeds [e k d]."""
         count, each = pose.shape[:2]
         where = (rows.candidate, rows.arm)
         frames = self._to_base[where][:, None] @ matrix_from_pose(pose) @ self._to_first_tool[where][:, None]
@@ -103,19 +100,13 @@ class Trials:
         return solution.joint_pos.reshape(*shape, -1), *errors
 
     def find_homes(self, near: Near, seeds: int, most: int) -> Postures:
-        """Postures that bring the tools home, at most so many an arm of a candidate, the nearest to `near` first.
-
-        Args:
-            near: preferred postures.
-            seeds: number of postures from which the search begins.
-            most: number of postures that are kept.
-        """
+        """At most `most` homes per arm and candidate, from `seeds` start postures, the nearest to `near` first."""
         rows, position, rotation = self._search_homes(near, seeds)
         rows = rows[_are_home(position, rotation)]
         return self._choose(rows[self._is_clear(rows)], near, most)
 
     def find_miss(self, near: Near, seeds: int) -> str:
-        """Why the candidates have no home, in words that follow a colon; `near` are postures [d] rad as in `find_homes`."""
+        """The reason why the candidates have no home; arguments as of `find_homes`."""
         rows, position, rotation = self._search_homes(near, seeds)
         for arm in (0, 1):
             mine = rows.arm == arm
@@ -126,21 +117,21 @@ class Trials:
         return "a link would stand in the table or on the other arm's side"
 
     def _search_homes(self, near: Near, seeds: int) -> tuple[Postures, np.ndarray, np.ndarray]:
-        """Postures from all starts of both arms of all candidates, and how far from home [e] m and rad they leave the tool."""
+        """Postures from all starts of both arms of all candidates, with the errors [e] m and rad of the home poses."""
         starts = [_start_postures(self.candidates[0], wanted, seeds) for wanted in near]
         pairs = np.array(list(product(range(len(self.candidates)), (0, 1))))
         rows = Postures(pairs[:, 0], pairs[:, 1], np.zeros((len(pairs), starts[0].shape[1])))
-        pose = np.stack([_tool_pose(HOME[arm]) for arm in rows.arm])[:, None].repeat(seeds, 1)
+        pose = np.stack([HOME[arm].pose for arm in rows.arm])[:, None].repeat(seeds, 1)
         joint_pos, position, rotation = self.solve(rows, pose, np.stack([starts[arm] for arm in rows.arm]))
         every = Postures(rows.candidate.repeat(seeds), rows.arm.repeat(seeds), joint_pos.reshape(-1, joint_pos.shape[-1]))
         return every, position.ravel(), rotation.ravel()
 
     def _choose(self, rows: Postures, near: Near, most: int) -> Postures:
-        """The postures of each arm that differ by more than 0.1 rad, with room to the limits where there are such."""
+        """The postures of each arm that differ by more than 0.1 rad, with a margin to the limits if there are any."""
         lower, upper = self.solver.lower, self.solver.upper
         wanted = [np.zeros(len(lower)) if posture is None else posture for posture in near]
         far = np.linalg.norm(rows.joint_pos - np.array(wanted)[rows.arm], axis=1)
-        tight = np.minimum(rows.joint_pos - lower, upper - rows.joint_pos).min(1) <= LIMIT_ROOM
+        tight = np.minimum(rows.joint_pos - lower, upper - rows.joint_pos).min(1) <= LIMIT_MARGIN
         chosen: dict[tuple[int, int], list[int]] = {}
         for row in np.lexsort((far, tight)):
             mine = chosen.setdefault((int(rows.candidate[row]), int(rows.arm[row])), [])
@@ -150,7 +141,7 @@ class Trials:
         return rows[np.array([row for mine in chosen.values() for row in mine], int)]
 
     def _is_clear(self, rows: Postures) -> np.ndarray:
-        """[e] bool: do all links that an arm's second joint and those after it move stay off the table and on their side?"""
+        """[e] bool, whether all links from an arm's second joint on are above the table or off it, and on their side."""
         clear = np.ones(len(rows.arm), bool)
         urdf = load_urdf(self.candidates[0].urdf)
         roots = np.array([[matrix_from_pose(arm.root_pose) for arm in robot.arms] for robot in self.candidates])
@@ -163,16 +154,15 @@ class Trials:
             stays = np.ones(len(joint_pos), bool)
             for name, points in self._hulls[side].items():
                 pose = root @ frames[name]
-                place = points @ pose[:, :3, :3].transpose(0, 2, 1) + pose[:, None, :3, 3]
-                over = (np.abs(place[..., :2]) < np.array(TABLE_SIZE[:2]) / 2).all(-1)
-                wrong = (place[..., 2] < TABLE_TOP + CLEARANCE) | (place[..., 0] * (2 * side - 1) < 0)
+                position = points @ pose[:, :3, :3].transpose(0, 2, 1) + pose[:, None, :3, 3]
+                over = (np.abs(position[..., :2]) < np.array(TABLE_SIZE[:2]) / 2).all(-1)
+                wrong = (position[..., 2] < TABLE_TOP + CLEARANCE) | (position[..., 0] * (2 * side - 1) < 0)
                 stays &= ~(over & wrong).any(1)
             clear[mine] = stays
         return clear
 
     def reached_shares(self, rows: Postures) -> np.ndarray:
-        """[e] share of the grasps that an arm reaches from home on a straight path; a quarter of it where it cannot go aside,
-        as every plan asks of an arm that has nothing to do."""
+        """[e] share of the grasps that an arm reaches from home on a straight path, divided by four if it cannot move aside."""
         path = np.stack([_grasp_paths(arm) for arm in (0, 1)])
         joint_pos = rows.joint_pos[:, None].repeat(path.shape[2], 1)
         for step in range(PATH_STEPS):
@@ -181,7 +171,7 @@ class Trials:
         return reached[:, 1:].mean(1) * np.where(reached[:, 0], 1.0, 0.25)
 
     def follow_plans(self, rows: Postures) -> np.ndarray:
-        """[e p] bool: does the arm follow each of `trial_plans`, tried at every `STRIDE`th frame, within its speed limits?"""
+        """[e p] bool, whether the arm follows each of `trial_plans` at every `STRIDE`th frame, within its speed limits."""
         pose = _plan_poses()
         joint_pos = rows.joint_pos[:, None].repeat(pose.shape[2], 1)
         good = np.ones(joint_pos.shape[:2], bool)
@@ -205,7 +195,7 @@ def trial_plans() -> tuple[ToolPath, ...]:
 
 @cache
 def _plan_poses() -> np.ndarray:
-    """[2 t p 7] tool poses of both arms at every `STRIDE`th frame of the plans; a plan that has ended stands still."""
+    """[2 t p 7] tool poses of both arms at every `STRIDE`th frame of the plans, extended at their last pose."""
     longest = -(-max(path.frame_count for path in trial_plans()) // STRIDE) + 1
     at = [np.minimum(STRIDE * np.arange(longest), path.frame_count - 1) for path in trial_plans()]
     return np.stack([path.pose[frames] for path, frames in zip(trial_plans(), at, strict=True)], 2).transpose(1, 0, 2, 3)
@@ -235,13 +225,8 @@ def _are_home(position: np.ndarray, rotation: np.ndarray) -> np.ndarray:
     return (position < POSITION_TOLERANCE) & (rotation < ROTATION_TOLERANCE)
 
 
-def _tool_pose(at: Tool) -> np.ndarray:
-    """[7] position and quaternion of a tool."""
-    return np.concatenate([at.position, at.rotation.as_quat()])
-
-
 def _link_points(robot: RobotSpec) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """For each arm, outermost points [k 3] m of the links that its second joint and those after it move."""
+    """For each arm, outermost points [k 3] m of the links from its second joint on."""
     urdf = load_urdf(robot.urdf)
     left, right = (
         {
@@ -255,7 +240,7 @@ def _link_points(robot: RobotSpec) -> tuple[dict[str, np.ndarray], dict[str, np.
 
 
 def _start_postures(robot: RobotSpec, near: np.ndarray | None, count: int) -> np.ndarray:
-    """[count d] postures: the wanted one, the middle of the limits, zero, and others spread over half a turn each way."""
+    """[count d] start postures: the preferred one, the middle of the limits, zero, and random ones within half a turn."""
     lower, upper = np.array(robot.joint_lower), np.array(robot.joint_upper)
     low, high = np.maximum(lower, -np.pi), np.minimum(upper, np.pi)
     spread = np.random.default_rng(0).uniform(low, high, (count, len(lower)))
