@@ -84,7 +84,7 @@ def test_a_config_changes_its_base(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("base: config.yaml", "has the base config.yaml; name that, since there is one level only"),
+        ("base: config.yaml", "has the base config.yaml; bases cannot be nested"),
         ("base: nowhere.yaml", "cannot read the config .*nowhere.yaml"),
         ("base: 3", "base is 3; expected the path of a config"),
         ("base: xew:fixd", "did you mean 'fixed'"),
@@ -103,7 +103,7 @@ def test_all_mistakes_at_once(tmp_path: Path) -> None:
 
 def test_missing_file_lists_what_there_is(tmp_path: Path) -> None:
     write(tmp_path, "name: x")
-    with pytest.raises(ConfigError, match=r"cannot read the config .*There is: .*config\.yaml"):
+    with pytest.raises(ConfigError, match=r"cannot read the config .*The folder has .*config\.yaml"):
         config.load(Outer, tmp_path / "other.yaml")
 
 

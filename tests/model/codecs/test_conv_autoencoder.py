@@ -142,10 +142,10 @@ def test_packaged_weights_are_found(monkeypatch: pytest.MonkeyPatch, weights: Pa
 def test_settings_and_files_that_do_not_fit_are_told(weights: Path, tmp_path: Path) -> None:
     tensors = load_file(weights)
     save_file(tensors, tmp_path / "nameless.safetensors")
-    with pytest.raises(ConfigError, match="does not say the size"):
+    with pytest.raises(ConfigError, match="does not hold the size"):
         load_autoencoder(tmp_path / "nameless.safetensors")
     (tmp_path / "broken.safetensors").write_bytes(weights.read_bytes()[:1000])
-    with pytest.raises(ConfigError, match="no whole safetensors file"):
+    with pytest.raises(ConfigError, match="not a whole safetensors file"):
         load_autoencoder(tmp_path / "broken.safetensors")
     with pytest.raises(ValueError, match="as many stages"):
         AutoencoderSize((8, 8), (1, 1), (8,), (1,))

@@ -225,7 +225,7 @@ def test_a_cut_file_is_told(arrays: Arrays, tmp_path: Path) -> None:
     path = tmp_path / "in.safetensors"
     save_file(arrays, path)
     path.write_bytes(path.read_bytes()[:-10])
-    assert "is no whole safetensors file" in refusal(path)
+    assert "is not a whole safetensors file" in refusal(path)
 
 
 @pytest.mark.lab
