@@ -50,7 +50,7 @@ def test_shapes_and_types(codec: ConvAutoencoderCodec) -> None:
     assert latents.shape == (4, 2, 3, 48) and latents.dtype == np.float32
     decoded = codec.decode(latents)
     assert decoded.shape == (13, 32, 48, 3) and decoded.dtype == np.uint8
-    with pytest.raises(ValueError, match="needs 4 k"):
+    with pytest.raises(ValueError, match="t = 4 k"):
         codec.encode(video[:12])
 
 
@@ -130,7 +130,7 @@ def test_missing_weights_are_told(monkeypatch: pytest.MonkeyPatch, tmp_path: Pat
     for path in (None, tmp_path / "nowhere.safetensors"):
         with pytest.raises(ConfigError, match="there are no weights at"):
             ConvAutoencoderCodec.open(CodecSettings(weights=path))
-    with pytest.raises(ConfigError, match=r"holds no \.safetensors; name one file"):
+    with pytest.raises(ConfigError, match=r"holds no \.safetensors; expected the path of one file"):
         ConvAutoencoderCodec.open(CodecSettings(weights=tmp_path))
 
 

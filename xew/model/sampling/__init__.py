@@ -1,3 +1,3 @@
-"""Prediction: a trained network continues episodes from their first frame and their commands."""
+"""Autoregressive prediction of episodes from their first frame and their commands."""
 
 __all__ = ["predict"]
