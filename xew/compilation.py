@@ -1,17 +1,17 @@
-"""JAX settings that processes share: the cache of compiled programs and the allocation of GPU memory."""
+"""Resources that processes share through JAX: compiled programs and a GPU's memory. JAX is imported on first use."""
 
 import os
 
 from xew.files import cache_folder
 
 LEAST = "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"
-"""Environment variable for the least compile time at which JAX caches a program."""
+"""Environment variable with the shortest compile time from which JAX caches a program."""
 
 
 def keep_compiled_programs() -> None:
-    """Cache compiled programs of all sizes in the user's cache folder, unless the user has configured JAX otherwise.
+    """Cache all compiled programs in the user's cache folder, unless JAX is configured otherwise.
 
-    By default JAX caches programs that compile for one second or more. Grading has eight shorter ones: 2.5 s on a CPU.
+    JAX by default caches only programs that compile for a second or more.
     """
     import jax
 
@@ -22,8 +22,8 @@ def keep_compiled_programs() -> None:
 
 
 def take_memory_as_needed() -> None:
-    """Make JAX allocate GPU memory on demand instead of three quarters at once, unless the user has configured it otherwise.
+    """Disable JAX's preallocation of GPU memory, unless the user has set it; call this before the first computation.
 
-    Call it before JAX's first computation, in commands that share a GPU with Warp or with worker processes.
+    Commands need it that share a GPU with Warp or with their own worker processes.
     """
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")

@@ -1,13 +1,13 @@
-"""Strict configs for all rooms: YAML -> frozen dataclasses, overridden from the command line, saved with the run.
+"""Strict configs for all packages: YAML -> frozen dataclasses, overridden from the command line, saved with the run.
 
-Whatever a user gets wrong (a missing file, an unknown key, a wrong type, an unknown name) raises ConfigError with what
-was found, what was expected and what to do; `user_errors` turns it into that message and exit code 2.
+A user's mistake (a missing file, an unknown key, a wrong type, an unknown name) raises ConfigError with the value found, the
+value expected and the remedy. `user_errors` prints that message and exits with code 2.
 
-`module:NAME` imports a module, which runs its code. It is for what a user types, and for the config that the user names
-(`pick`). What data, runs, rollouts and score tables say of themselves is imported only from modules that the user admits
-(`pick_recorded`).
+`module:NAME` imports a module and so runs its code. `pick` imports names that the user types or that the user's config holds.
+`pick_recorded` imports names in data, runs, rollouts and score tables only from modules that the user admits.
 """
 
+import contextlib
 import dataclasses
 import difflib
 import errno
@@ -34,31 +34,31 @@ T = TypeVar("T")
 
 
 CONFIGS = Path(__file__).parent / "configs"
-"""Folder of the configs that come with xew; in the repository a link to the folder at its root."""
+"""Folder of the packaged configs; in the repository a link to the folder at its root."""
 PACKAGED = "xew:"
-"""Beginning of the names of configs that come with xew."""
+"""Prefix of the names of packaged configs."""
 BASE = "base"
-"""Key of a config that names the config that it changes."""
+"""Key of a config that names its base config."""
 LARGEST = 2**63 - 1
-"""Largest whole number of a config."""
+"""Largest integer in a config."""
 IMPORT_PATH = re.compile(r"([^\W\d]\w*(?:\.[^\W\d]\w*)*):[^\W\d]\w*")
-"""Form of the name of an object of a module, `module:NAME`."""
+"""Pattern of `module:NAME`."""
 TRUST = "XEW_TRUST"
-"""Name of the environment variable that lists admitted modules, separated by commas; processes inherit it."""
+"""Environment variable with the admitted modules, separated by commas; child processes inherit it."""
 
 
 PIPE_CLOSED = 141
-"""Exit code of a command whose output nobody reads any longer: 128 and the number of SIGPIPE, as shells have it."""
+"""Exit code of a command whose output pipe was closed: 128 + SIGPIPE, as in shells."""
 DISK_FAULTS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO)
-"""Numbers of errors of the system that are no mistake of this program, also where they name no file."""
+"""System errors that are reported as the user's even if they name no file."""
 
 
 class ConfigError(Exception):
-    """A user's setting cannot be used; the message says what to do."""
+    """A user's setting cannot be used; the message gives the remedy."""
 
 
 class UntrustedError(ConfigError):
-    """A file names a module that the user has not admitted; nothing of it was imported."""
+    """A file names a module that the user has not admitted; it was not imported."""
 
 
 def load(cls: type[T], path: Path | str, overrides: Sequence[str] = ()) -> T:
@@ -66,7 +66,7 @@ def load(cls: type[T], path: Path | str, overrides: Sequence[str] = ()) -> T:
 
     Raises:
         ConfigError: no such file, not YAML, unknown key, missing key, wrong type or a number that is not finite.
-        SystemExit: an override is unknown or malformed (tyro has told so; code 2), or asks for --help (code 0).
+        SystemExit: an override is unknown or malformed (code 2), or asks for --help (code 0).
     """
     loaded = parse(cls, read_yaml(path), str(path))
     if overrides:
@@ -76,7 +76,7 @@ def load(cls: type[T], path: Path | str, overrides: Sequence[str] = ()) -> T:
 
 
 def find_config(path: Path | str) -> Path:
-    """Where a config lies: `xew:NAME` is the one that comes with xew, and so is `configs/NAME.yaml` where no such file is.
+    """Path of a config. `xew:NAME`, and `configs/NAME.yaml` if no such file exists, name a packaged one.
 
     Raises:
         ConfigError: xew has no config of that name.
@@ -84,7 +84,7 @@ def find_config(path: Path | str) -> Path:
     path = Path(path)
     if is_packaged(path):
         name = str(path).removeprefix(PACKAGED)
-        known = sorted(str(file.relative_to(CONFIGS).with_suffix("")) for file in CONFIGS.rglob("*.yaml"))
+        known = sorted(file.relative_to(CONFIGS).with_suffix("").as_posix() for file in CONFIGS.rglob("*.yaml"))
         if name not in known:
             raise ConfigError(f"xew has no config {name!r};{suggestion(name, known)} known: {', '.join(known)}.")
         return CONFIGS / f"{name}.yaml"
@@ -93,15 +93,14 @@ def find_config(path: Path | str) -> Path:
 
 
 def is_packaged(path: Path) -> bool:
-    """Whether a path is the name of a config that comes with xew, such as xew:fixed."""
+    """Whether a path is the name of a packaged config, such as xew:fixed."""
     return str(path).startswith(PACKAGED)
 
 
 def read_yaml(path: Path | str) -> Any:
-    """The content of a YAML file, which may be one that comes with xew, on top of the config that its key `base` names.
+    """The content of a YAML file, merged over the config that its key `base` names.
 
-    `base: fixed.yaml` is a path from the file's own folder, or `xew:NAME`. The file's keys replace those of its base, section
-    by section. A base has no base itself.
+    `base` is `xew:NAME` or a path relative to the file's folder. The file's keys replace the base's keys, section by section.
 
     Raises:
         ConfigError: a file is missing or not YAML, or the base has a base.
@@ -118,7 +117,7 @@ def read_yaml(path: Path | str) -> Any:
     if not isinstance(below, Mapping):
         raise ConfigError(f"{path}: its base {base} has no keys and values.")
     if BASE in below:
-        raise ConfigError(f"{path}: its base {base} has the base {below[BASE]}; name that, since there is one level only.")
+        raise ConfigError(f"{path}: its base {base} has the base {below[BASE]}; bases cannot be nested, name {below[BASE]}.")
     return merge_settings(below, changes)
 
 
@@ -127,7 +126,7 @@ def _read_content(path: Path) -> Any:
         return yaml.safe_load(demand_regular(path).read_text())
     except OSError as error:
         siblings = sorted(str(p) for p in path.parent.glob("*.yaml"))
-        known = f" There is: {', '.join(siblings)}." if siblings else ""
+        known = f" The folder has {', '.join(siblings)}." if siblings else ""
         raise ConfigError(f"cannot read the config {path}: {error.strerror or error}.{known}") from error
     except RecursionError as error:
         raise ConfigError(f"{path} is nested too deeply for a config.") from error
@@ -145,7 +144,7 @@ def merge_settings(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[s
 
 
 def parse(cls: type[T], content: Any, source: str) -> T:
-    """Structure plain YAML content as the frozen dataclass `cls`; `source` names it in errors."""
+    """Structure plain YAML content as the frozen dataclass `cls`. Raises ConfigError, which names `source`."""
     if not isinstance(content, Mapping):
         raise ConfigError(f"{source}: expected keys and values, found {type(content).__name__}.")
     try:
@@ -156,95 +155,85 @@ def parse(cls: type[T], content: Any, source: str) -> T:
 
 
 def save(config: Any, path: Path) -> None:
-    """Write the resolved config as YAML that `load` reads back to an equal object. Raises OSError where it cannot."""
+    """Write the resolved config as YAML that `load` reads back to an equal object. Raises OSError if it fails."""
     write_text(path, yaml.safe_dump(CONVERTER.unstructure(config), sort_keys=False, allow_unicode=True))
 
 
 def digest(config: Any) -> str:
-    """A canonical text of a config, equal for equal configs."""
+    """Canonical text of a config, equal for equal configs."""
     return json.dumps(CONVERTER.unstructure(config), sort_keys=True)
 
 
 def pick(registry: Mapping[str, T], name: str, kind: str, also: tuple[type, ...] = ()) -> T:
-    """The entry of a registry, or for `module:NAME` an object imported from outside.
+    """The entry of a registry, or for `module:NAME` the imported object.
 
     Args:
-        also: types that an object from outside may have, beside those of the registry's entries.
+        also: types of imported objects that are accepted besides the types of the registry's entries.
 
     Raises:
-        ConfigError: neither exists (the nearest name is suggested), or what was imported is of another type.
+        ConfigError: neither exists (the nearest name is suggested), or the imported object has another type.
     """
     if name in registry:
         return registry[name]
     if ":" in name:
         module, _, attribute = name.partition(":")
         try:
-            found = getattr(importlib.import_module(module), attribute)
+            imported = getattr(importlib.import_module(module), attribute)
         except (ImportError, AttributeError, ValueError) as error:
             raise ConfigError(f"cannot import the {kind} {name!r}: {error}; expected module:NAME.") from error
         expected = tuple({type(entry) for entry in registry.values() if entry is not None})
-        if not isinstance(found, (*expected, *also)):
+        if not isinstance(imported, (*expected, *also)):
             names = " or ".join(kind.__name__ for kind in expected)
-            raise ConfigError(f"the {kind} {name!r} is a {type(found).__name__}; expected a {names}.")
-        admit([module])  # its code has run by the user's own word; files may name it from now on
-        return cast(T, found)
+            raise ConfigError(f"the {kind} {name!r} is a {type(imported).__name__}; expected a {names}.")
+        admit([module])  # the user named it, so files may name it from now on
+        return cast(T, imported)
     raise ConfigError(f"unknown {kind} {name!r};{suggestion(name, registry)} known: {', '.join(registry)}, or module:NAME.")
 
 
 def pick_recorded(registry: Mapping[str, T], name: str, kind: str) -> T:
-    """`pick` for a name that a file gives: `module:NAME` only of a module that the user has admitted.
-
-    Raises:
-        UntrustedError: the module is not admitted; it is not imported.
-        ConfigError: as `pick`.
-    """
+    """`pick` for a name in a file: raises UntrustedError for `module:NAME` if the user has not admitted the module."""
     if name not in registry:
         demand_admitted(name, f"the {kind}")
     return pick(registry, name, kind)
 
 
 def admit(names: Iterable[str]) -> None:
-    """Admit modules, in this process and in those that it starts.
+    """Admit modules with their submodules, in this process and its child processes.
 
     Args:
-        names: modules, as `my_lab.tasks`, with all that lies below them; or `module:NAME`, of which the module counts.
+        names: modules such as `my_lab.tasks`, or `module:NAME`, which admits the module.
 
     Raises:
-        ConfigError: one is no name of a module.
+        ConfigError: a name is not a module name.
     """
     modules = [name.partition(":")[0] for name in names]
     for module in modules:
         if not all(part.isidentifier() for part in module.split(".")):
-            raise ConfigError(f"--trust {module!r} is no name of a module; expected one as my_lab.tasks.")
+            raise ConfigError(f"--trust {module!r} is not a module name; expected a name such as my_lab.tasks.")
     if modules:
         os.environ[TRUST] = ",".join(sorted({*_admitted(), *modules}))
 
 
 def admit_named(content: Any) -> None:
-    """Admit every module that a config, or its plain content, names as `module:NAME`: the user named the config."""
+    """Admit every module that a user's config, or its plain content, names as `module:NAME`."""
     admit(find_import_paths(content))
 
 
 def demand_admitted(content: Any, source: str) -> None:
-    """Check what a file says of itself (a name, a config or plain content) before anything that it names is looked up.
-
-    Raises:
-        UntrustedError: it names a module that the user has not admitted.
-    """
+    """Raise UntrustedError if content of a file (a name, a config, plain content) names a module that is not admitted."""
     for name in find_import_paths(content):
         module = name.partition(":")[0]
         if not any(module == admitted or module.startswith(f"{admitted}.") for admitted in _admitted()):
             raise UntrustedError(
-                f"{source} names {name!r}, which would run the code of a module that you did not name yourself. If you trust "
+                f"{source} names {name!r}, which would run code of a module that you did not name yourself. If you trust "
                 f"{module}, admit it: --trust {module}"
             )
 
 
 def check_finite(settings: Any, source: str, name: str = "") -> None:
-    """Check the numbers of a config, as given or nested: they are finite, and whole ones fit into 64 bits.
+    """Raise ConfigError unless all numbers of a config are finite and its integers fit into 64 bits.
 
-    Raises:
-        ConfigError: one does not; `source` names the config and `name` where in it the settings stand.
+    The message names `source` and `name`, the path of the setting in the config.
     """
     if dataclasses.is_dataclass(settings) and not isinstance(settings, type):
         settings = {field.name: getattr(settings, field.name) for field in dataclasses.fields(settings)}
@@ -261,7 +250,7 @@ def check_finite(settings: Any, source: str, name: str = "") -> None:
 
 
 def find_import_paths(content: Any) -> list[str]:
-    """All texts of the form `module:NAME` in a config or in plain content, sorted."""
+    """All strings of the form `module:NAME` in a config or in plain content, sorted."""
     if dataclasses.is_dataclass(content) and not isinstance(content, type):
         content = {field.name: getattr(content, field.name) for field in dataclasses.fields(content)}
     if isinstance(content, str):
@@ -284,10 +273,9 @@ def suggestion(name: str, known: Iterable[str]) -> str:
 
 
 def user_errors(main: Callable[..., T]) -> Callable[..., T]:
-    """Decorate a command: a user's mistake prints its message on stderr and exits with code 2, without a traceback.
+    """Decorate a command: a user's mistake prints its message on stderr and exits with code 2, Ctrl-C with code 130.
 
-    So does Ctrl-C, with code 130. Where the reader of a pipe goes away, as `| head` does, the command ends quietly with
-    PIPE_CLOSED.
+    A closed output pipe, as with `| head`, ends the command quietly with PIPE_CLOSED.
     """
 
     @functools.wraps(main)
@@ -296,7 +284,8 @@ def user_errors(main: Callable[..., T]) -> Callable[..., T]:
             try:
                 return main(*args, **kwargs)
             finally:
-                _flush(sys.stdout)  # here, because at the end of the process nobody can catch what a closed pipe raises
+                if sys.stdout is not None and not sys.stdout.closed:
+                    sys.stdout.flush()  # here, because the error of a closed pipe cannot be caught at exit
         except BrokenPipeError:
             if not _silence_closed_pipes():
                 raise
@@ -308,60 +297,47 @@ def user_errors(main: Callable[..., T]) -> Callable[..., T]:
             if error.filename is None and error.errno not in DISK_FAULTS:
                 raise
             where = f"{error.filename}: " if error.filename is not None else ""
-            print(f"error: {where}{error.strerror}; mend that, or name another place.", file=sys.stderr)
+            print(f"error: {where}{error.strerror}; fix that, or choose another path.", file=sys.stderr)
             raise SystemExit(2) from None
         except KeyboardInterrupt:
-            print("stopped; the same command goes on from what is done", file=sys.stderr)
+            print("stopped; the same command continues from here", file=sys.stderr)
             raise SystemExit(130) from None
 
     return guarded
 
 
-def _flush(stream: TextIO | None) -> None:
-    """Write out what a stream holds back; a process may have none, or have closed it."""
-    if stream is not None and not stream.closed:
-        stream.flush()
-
-
 def _silence_closed_pipes() -> bool:
-    """Discard what is still to be written to a pipe without a reader, and return whether there was such a pipe."""
+    """Redirect output to closed pipes to /dev/null, and return whether there was one."""
     closed = [stream for stream in (sys.stdout, sys.stderr) if stream is not None and _has_no_reader(stream)]
     for stream in closed:
-        nowhere = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(nowhere, stream.fileno())
-        os.close(nowhere)
+        null = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(null, stream.fileno())
+        os.close(null)
     return bool(closed)
 
 
 def _has_no_reader(stream: TextIO) -> bool:
-    """Whether a stream writes into a pipe that nobody reads; a failed write may have left nothing to flush."""
+    """Whether a stream writes into a pipe without a reader."""
     poller = select.poll()
     try:
         poller.register(stream.fileno(), 0)
-    except (OSError, ValueError):  # a stream without a file, as tests and notebooks have
+    except (OSError, ValueError):  # a stream without a file descriptor, as in tests and notebooks
         return False
     return any(event & (select.POLLERR | select.POLLHUP) for _, event in poller.poll(0))
 
 
 def _exact(kind: type, accepts: tuple[type, ...]) -> Callable[[Any, type], Any]:
-    """A structure hook that converts nothing: YAML's own types are what a config means."""
+    """A structure hook that accepts YAML's own types and, for floats, text such as 5e-5 (YAML 1.1 requires 5.0e-5)."""
 
     def structure(value: Any, _: type) -> Any:
-        if kind is float and isinstance(value, str):
-            value = _yaml_1_2_float(value)
+        if kind is float and isinstance(value, str) and "e" in value.lower():
+            with contextlib.suppress(ValueError):
+                value = float(value)
         if not isinstance(value, accepts) or (isinstance(value, bool) and kind is not bool):
             raise TypeError(f"expected {kind.__name__}, found {type(value).__name__} {value!r}")
         return kind(value)
 
     return structure
-
-
-def _yaml_1_2_float(text: str) -> float | str:
-    """PyYAML reads 5e-5 as text (YAML 1.1 wants 5.0e-5); people mean the number."""
-    try:
-        return float(text) if "e" in text.lower() else text
-    except ValueError:
-        return text
 
 
 def _structure_names(value: Any, kind: type) -> tuple[str, ...]:
@@ -371,7 +347,7 @@ def _structure_names(value: Any, kind: type) -> tuple[str, ...]:
 
 
 def _reason(error: BaseException, kind: type | None) -> str:
-    """Say in words what is wrong: unknown keys with a suggestion, the rest as cattrs says it."""
+    """Message of a structuring error: unknown keys with a suggestion, others as cattrs words them."""
     if isinstance(error, cattrs.ForbiddenExtraKeysError):
         known = [field.name for field in dataclasses.fields(error.cl)]
         return " ".join(
@@ -385,7 +361,7 @@ def _reason(error: BaseException, kind: type | None) -> str:
 
 
 def _put_path_first(reason: str) -> str:
-    """Put the path, which cattrs appends as " @ .path", first."""
+    """Move the path, which cattrs appends as " @ .path", to the front."""
     message, _, path = reason.rpartition(" @ ")
     return f"{path.lstrip('.')}: {message}" if path.strip(".") else message or reason
 

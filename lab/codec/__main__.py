@@ -1,10 +1,10 @@
-"""Train the codec, an autoencoder, on the project's own frames: episodes to a file of weights that a codec reads.
+"""Train the codec, an autoencoder, on frames of episodes.
 
-Reads  episodes of training seeds; test seeds only where `report.test_seeds` asks for them
+Reads  episodes of training seeds; test seeds only for the report, with `report.test_seeds`
 Writes <out>/autoencoder.safetensors and autoencoder.json, which `codec.weights: <out>` reads;
-       report.md and pictures of what the codec leaves, config, checkpoints, metrics
+       report.md and pictures of reconstructions, config, checkpoints, metrics
 
-The loss is L1 + MSE + LPIPS + a small penalty on latents, without an adversary: frames are rendered, and sharp edges are few.
+The loss is L1 + MSE + LPIPS + a small penalty on latents, without an adversary, because rendered frames have few sharp edges.
 Command: python -m lab.codec CONFIG [--resume | --overwrite] [--train.seconds … and other overrides]
 """
 
@@ -49,9 +49,9 @@ from xew.model.video.comparison import strip
 from xew.model.video.frames import to_model_size
 
 SMALLEST_DEVIATION = 1e-3
-"""Smallest deviation of a latent channel; unused channels are not amplified."""
+"""Smallest standard deviation of a latent channel, so an unused channel is not amplified."""
 ENDLESS = 2**40
-"""Number of steps of a training whose time ends it."""
+"""Number of steps of a run with a time budget."""
 
 
 @dataclass(frozen=True)
@@ -73,17 +73,13 @@ def main(arguments: Sequence[str] | None = None, prog: str = "python -m lab.code
     check_one_of(flags.resume, flags.overwrite)
     keep_compiled_programs()
     with hold_lock(experiment.out):
-        ended = train_codec(experiment, resume=flags.resume, overwrite=flags.overwrite)
-    if not ended:
+        completed = train_codec(experiment, resume=flags.resume, overwrite=flags.overwrite)
+    if not completed:
         sys.exit(STOPPED)
 
 
 def train_codec(experiment: CodecExperiment, *, resume: bool = False, overwrite: bool = False) -> bool:
-    """Train to the end, from the start or from the latest checkpoint; then measure, and write the weights.
-
-    Returns:
-        Whether the end was reached.
-    """
+    """Train from the start or the latest checkpoint, then write and measure the weights; returns whether it is done."""
     check_lpips()
     settings = experiment.train
     dataset = read_dataset(experiment.data)
@@ -117,15 +113,15 @@ def train_codec(experiment: CodecExperiment, *, resume: bool = False, overwrite:
             )
             take_step = make_codec_step(graph, statistics, experiment)
             state = run_steps(timetable, session, Meter(summarize, settings.batch), take_step, state, batches, draw_samples)
-        ended = batches.is_over(int(state.step))
-        if ended:
+        completed = batches.is_over(int(state.step))
+        if completed:
             print(f"{int(state.step)} steps in {batches.clock.elapsed:.0f} s")
             finish(experiment, nnx.merge(graph, state.ema, statistics), batches, dataset, int(state.step), log)
-    return ended
+    return completed
 
 
 def load_pictures(experiment: CodecExperiment, episodes: Sequence[Episode]) -> Pictures:
-    """Decode and draw what is learned from, and put it on the device where it has room."""
+    """Decode and draw the training pictures, and put them on the device if they fit."""
     begin = time.perf_counter()
     streams = [name for name, share in experiment.streams.items() if share]
     host_gb, regions = experiment.pictures.host_gb, experiment.train.region > 0
@@ -136,7 +132,7 @@ def load_pictures(experiment: CodecExperiment, episodes: Sequence[Episode]) -> P
 
 
 def sample_picture(module: ConvAutoencoder, episode: Episode, experiment: CodecExperiment) -> np.ndarray:
-    """A strip [2h w 3] uint8 of one training clip of an episode's scene, true above decoded."""
+    """A strip [2h w 3] uint8 of one clip of an episode's scene, ground truth above reconstruction."""
     folder, record = episode
     cut = experiment.cut
     times = np.minimum(np.arange(cut.frames), record.frame_count - 1)
@@ -147,14 +143,14 @@ def sample_picture(module: ConvAutoencoder, episode: Episode, experiment: CodecE
 
 @jax.jit
 def reconstruct_clip(module: ConvAutoencoder, clip: jax.Array) -> jax.Array:
-    """What the autoencoder leaves of one clip [t h w 3] uint8, without noise."""
+    """Reconstruction of one clip [t h w 3] uint8 by the autoencoder, without noise."""
     return to_pictures(module.decode_groups(module.encode_groups(to_signed(clip[None])))[0])
 
 
 def finish(
     experiment: CodecExperiment, module: ConvAutoencoder, batches: Batches, dataset: Dataset, step: int, log: RunLog
 ) -> None:
-    """Compute the statistics of the latents, write the weights with them, measure what they leave, and write the report."""
+    """Compute the statistics of the latents, write the weights, measure reconstructions, and write the report."""
     out = experiment.out
     mean, std = latent_statistics(module, batches, experiment.train.statistics_clips)
     module.latents_mean.set_value(mean)
@@ -173,35 +169,34 @@ def finish(
         "latents_mean": mean.tolist(),
         "latents_std": std.tolist(),
     }
-    write_description(experiment, description)  # kept also where the report fails
+    write_description(experiment, description)  # in case the report fails
     qualities = measure_codec(experiment, codec, dataset, out / "pictures" if experiment.report.pictures else None)
     write_description(experiment, description | {"reconstruction": report_rows(qualities)})
     if qualities:
         log.scalars(step, report_scalars(qualities))
         print(write_report(qualities, experiment))
-    print(f"{weights} ({weights.stat().st_size / 1e6:.2f} MB): use it by --codec.weights {out}")
+    print(f"{weights} ({weights.stat().st_size / 1e6:.2f} MB): use it with --codec.weights {out}")
 
 
 def write_description(experiment: CodecExperiment, description: dict[str, Any]) -> None:
-    """Write the file next to the weights."""
+    """Write autoencoder.json next to the weights."""
     path = experiment.out / "autoencoder.json"
     write_text(path, json.dumps(description, indent=1) + "\n")
 
 
 def latent_statistics(module: ConvAutoencoder, batches: Batches, count: int) -> tuple[jax.Array, jax.Array]:
-    """Mean and standard deviation [c] of the latents of about `count` clips, drawn as in training and shown as they are."""
+    """Mean and standard deviation [c] of the latents of about `count` clips, drawn as in training, without augmentation."""
 
     @jax.jit
     def moments(module: ConvAutoencoder, clips: jax.Array) -> tuple[jax.Array, jax.Array]:
         latents = module.encode_groups(to_signed(clips))
         return latents.mean(axis=(0, 1, 2)), jnp.square(latents).mean(axis=(0, 1, 2))
 
-    rounds = max(1, count // batches.settings.batch)
-    found = []
-    for number in range(rounds):
+    of_batches = []
+    for number in range(max(1, count // batches.settings.batch)):
         clips, _ = batches.pick(ENDLESS + number)
-        found.append([np.asarray(part, np.float64) for part in moments(module, clips)])
-    mean, squares = np.mean(found, axis=0)
+        of_batches.append([np.asarray(part, np.float64) for part in moments(module, clips)])
+    mean, squares = np.mean(of_batches, axis=0)
     std = np.sqrt(np.maximum(squares - np.square(mean), 0))
     return jnp.asarray(mean, jnp.float32), jnp.asarray(np.maximum(std, SMALLEST_DEVIATION), jnp.float32)
 

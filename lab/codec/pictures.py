@@ -1,10 +1,10 @@
-"""Pictures that an autoencoder learns from: clips of every stream, decoded or drawn once and kept in memory.
+"""Training pictures of an autoencoder: clips of every stream, decoded or drawn once and held in memory.
 
 Reads  episodes
-Writes `Pictures`: uint8 [n t h w 3] of all clips, the robot's pixels in them, and which stream each is of
+Writes `Pictures`: uint8 [n t h w 3] of all clips, the robot's pixels in them, and their streams
 
-Streams that have a frame for each frame of an episode are cut into clips one after another, of which every `every`-th is
-taken; those that describe a robot are drawn once a robot and taken whole, in groups as a codec takes them.
+Streams with a frame for each frame of an episode are cut into consecutive clips, of which every `every`-th is taken. Those that
+describe a robot are drawn once for each robot and taken whole, in the codec's groups.
 """
 
 import zlib
@@ -28,11 +28,11 @@ from xew.model.conditions import make_command
 from xew.model.video.frames import TEMPORAL_FACTOR, to_model_size
 
 STORED = {"rgb": "rgb.mkv", "robot_render": "robot.mkv"}
-"""Streams that every episode has as a file."""
+"""Streams that are files of an episode."""
 DRAWN = {"optical_flow": conditions.optical_flow, "mask": conditions.robot_mask, "ray_map": conditions.ray_map}
-"""Streams of pictures that are drawn from an episode's commands."""
+"""Streams that are drawn from an episode's commands."""
 ALIGNED = (*STORED, *DRAWN)
-"""Streams that have a frame for each frame of an episode."""
+"""Streams with a frame for each frame of an episode."""
 UNALIGNED = {
     "reference_image": conditions.reference_image,
     "nine_views": conditions.nine_views,
@@ -46,19 +46,19 @@ Masks = Bool[np.ndarray, "t h w"]
 
 @dataclass(frozen=True)
 class Cut:
-    """What is cut out of a video."""
+    """Cutting of videos into clips."""
 
     frames: int
     """Number of frames of a clip."""
     every: int
     height: int
-    """Height to which frames are brought."""
+    """Height of the resized frames."""
     width: int
     drawn_every: int = 1
-    """Number of episodes of which one's DRAWN streams are taken."""
+    """Interval of the episodes whose DRAWN streams are taken."""
 
     def starts(self, record: Record) -> list[int]:
-        """First frames of an episode's clips; where the first of them lies differs from episode to episode."""
+        """First frames of an episode's clips, with an offset that differs between episodes."""
         stride = self.every * self.frames
         phase = zlib.crc32(f"{record.task}/{record.seed}/{record.robot}".encode()) % stride
         last = record.frame_count - self.frames
@@ -72,17 +72,17 @@ class Cut:
 
 @dataclass(frozen=True)
 class Pictures:
-    """All clips that are learned from."""
+    """All training clips."""
 
     clips: Any
     """[n t h w 3] uint8, in the host's memory or on a device."""
     regions: Any
-    """[n k h w] uint8, one bit a frame from the highest on: the robot's pixels; None where they are not asked for."""
+    """Mask of the robot [n k h w] uint8, one bit per frame from the highest on, or None."""
     streams: dict[str, range]
-    """Stream -> numbers of its clips."""
+    """Stream -> indices of its clips."""
 
     def describe(self) -> str:
-        """How many clips of which streams there are, and their size."""
+        """Numbers of clips by stream, and their size."""
         counts = ", ".join(f"{len(numbers)} of {name}" for name, numbers in self.streams.items())
         return f"{len(self.clips)} clips ({counts}), {self.clips.nbytes / 1e9:.2f} GB"
 
@@ -93,11 +93,11 @@ def gather_pictures(
     """Decode and draw the clips of some streams of some episodes, in threads.
 
     Args:
-        episodes: those to learn from.
+        episodes: training episodes.
         streams: names among ALIGNED and UNALIGNED.
-        cut: what is taken of a video.
+        cut: cutting of the videos.
         host_gb: largest size of all clips [GB].
-        regions: whether the robot's pixels are kept too.
+        regions: whether masks of the robot are included.
 
     Raises:
         ConfigError: there would be more than `host_gb`.
@@ -106,7 +106,7 @@ def gather_pictures(
     aligned = [name for name in streams if name in ALIGNED]
     short = _cut_descriptions(episodes, [name for name in streams if name in UNALIGNED], cut)
     firsts = {name: _first_clips(episodes, cut, cut.drawn_every if name in DRAWN else 1) for name in aligned}
-    counts = {name: int(found[-1]) for name, found in firsts.items()} | {name: len(clips) for name, clips in short.items()}
+    counts = {name: int(of_name[-1]) for name, of_name in firsts.items()} | {name: len(clips) for name, clips in short.items()}
     total = sum(counts.values())
     if total * cut.clip_bytes > host_gb * 1e9:
         raise ConfigError(
@@ -118,11 +118,11 @@ def gather_pictures(
     clips = np.empty((total, cut.frames, cut.height, cut.width, 3), np.uint8)
     bits = np.zeros((total, -(-cut.frames // 8), cut.height, cut.width), np.uint8) if regions else None
 
-    def put(name: str, offset: int, found: np.ndarray, masks: np.ndarray | None) -> None:
-        place = slice(ranges[name].start + offset, ranges[name].start + offset + len(found))
-        clips[place] = found
+    def put(name: str, offset: int, added: np.ndarray, masks: np.ndarray | None) -> None:
+        target = slice(ranges[name].start + offset, ranges[name].start + offset + len(added))
+        clips[target] = added
         if bits is not None and masks is not None:
-            bits[place] = np.packbits(masks, axis=1)
+            bits[target] = np.packbits(masks, axis=1)
 
     def load(number: int) -> None:
         folder, record = episodes[number]
@@ -132,13 +132,13 @@ def gather_pictures(
         read = read_aligned(folder, record, wanted, times.ravel().tolist(), regions=regions)
         for name, (video, mask) in read.items():
             shape = len(starts), cut.frames, cut.height, cut.width
-            found = to_model_size(video, cut.height, cut.width).reshape(*shape, 3)
+            resized = to_model_size(video, cut.height, cut.width).reshape(*shape, 3)
             masks = None if mask is None else mask_to_model_size(mask, cut).reshape(shape)
-            put(name, int(firsts[name][number]), found, masks)
+            put(name, int(firsts[name][number]), resized, masks)
 
-    for name, found in short.items():
-        masks = differs_from_corner(found.reshape(-1, *found.shape[2:])).reshape(found.shape[:-1]) if regions else None
-        put(name, 0, found, masks)
+    for name, cuts in short.items():
+        masks = differs_from_corner(cuts.reshape(-1, *cuts.shape[2:])).reshape(cuts.shape[:-1]) if regions else None
+        put(name, 0, cuts, masks)
     if aligned:
         loaded = map_in_order(load, range(len(episodes)))
         for _ in tqdm(loaded, desc="pictures", total=len(episodes), unit="episode"):
@@ -147,7 +147,7 @@ def gather_pictures(
 
 
 def _first_clips(episodes: Sequence[Episode], cut: Cut, every: int) -> Integer[np.ndarray, " n"]:
-    """Number of a stream's first clip of each episode, and their count at the end, where every `every`-th episode is taken."""
+    """Index [n + 1] of a stream's first clip of each episode, and the total, if every `every`-th episode is taken."""
     counts = (len(cut.starts(record)) if number % every == 0 else 0 for number, (_, record) in enumerate(episodes))
     return np.cumsum([0, *counts])
 
@@ -155,13 +155,13 @@ def _first_clips(episodes: Sequence[Episode], cut: Cut, every: int) -> Integer[n
 def read_aligned(
     folder: Path, record: Record, streams: Sequence[str], times: Sequence[int], *, regions: bool = True
 ) -> dict[str, tuple[Video, Masks | None]]:
-    """Frames [t 240 320 3] of an episode's streams at some times, each with the robot's pixels in them [t 240 320].
+    """Frames [t 240 320 3] of an episode's streams at some times, each with the mask of the robot [t 240 320] or None.
 
     Args:
         folder, record: the episode.
         streams: names among ALIGNED.
-        times: numbers of frames.
-        regions: whether the robot's pixels are wanted; None stands for them where they are not.
+        times: indices of frames.
+        regions: whether masks are included.
 
     Raises:
         EpisodeError: a video is missing or damaged.
@@ -169,7 +169,7 @@ def read_aligned(
     drawn = any(name in DRAWN for name in streams)
     states = read_states(folder) if drawn or regions else None
     command = make_command(folder, record, states) if states is not None and drawn else None
-    chosen, found = np.asarray(times), {}
+    chosen, pairs = np.asarray(times), {}
     for name in streams:
         if name in STORED:
             frames = read_frames(folder / STORED[name], set(times))
@@ -180,8 +180,8 @@ def read_aligned(
         mask = None
         if regions and states is not None:
             mask = states.robot_mask[chosen] if name == "rgb" else differs_from_corner(video)
-        found[name] = video, mask
-    return found
+        pairs[name] = video, mask
+    return pairs
 
 
 def draw_descriptions(streams: Sequence[str], episode: Episode) -> dict[str, Video]:
@@ -197,17 +197,17 @@ def _cut_descriptions(episodes: Sequence[Episode], streams: Sequence[str], cut: 
         return {}
     robots = {record.robot: (folder, record) for folder, record in reversed(episodes)}
     drawn = map_in_order(lambda robot: draw_descriptions(streams, robots[robot]), sorted(robots))
-    found: dict[str, list[np.ndarray]] = {name: [] for name in streams}
+    cuts: dict[str, list[np.ndarray]] = {name: [] for name in streams}
     for videos in tqdm(drawn, desc="robots", total=len(robots), unit="robot"):
         for name, video in videos.items():
-            found[name].append(cut_description(to_model_size(video, cut.height, cut.width), cut.frames))
-    return {name: np.concatenate(clips) for name, clips in found.items()}
+            cuts[name].append(cut_description(to_model_size(video, cut.height, cut.width), cut.frames))
+    return {name: np.concatenate(clips) for name, clips in cuts.items()}
 
 
 def cut_description(video: Video, frames: int) -> UInt8[np.ndarray, "n f h w 3"]:
     """Clips [n frames h w 3] of a short video [t h w 3] of 4 k + 1 frames.
 
-    Groups of four as a codec takes them, the first frame four times; else its beginning, its last frame repeated.
+    For four frames, the codec's groups (the first frame four times); otherwise its beginning, padded by its last frame.
     """
     if frames != TEMPORAL_FACTOR:
         return take_frames(video, 0, frames)[None]
@@ -216,20 +216,20 @@ def cut_description(video: Video, frames: int) -> UInt8[np.ndarray, "n f h w 3"]
 
 
 def differs_from_corner(video: Video) -> Masks:
-    """Pixels [t h w] bool of a drawn video [t h w 3] that are not the background, which is the color of its first pixel."""
-    # Channel by channel: `any` over an axis of three takes ten times as long.
+    """Mask [t h w] bool of a drawn video [t h w 3] where it differs from the background, the color of its first pixel."""
+    # By channel, because `any` over an axis of three takes ten times as long.
     red, green, blue = (video[..., channel] != video[0, 0, 0, channel] for channel in range(3))
     return red | green | blue
 
 
 def mask_to_model_size(mask: Masks, cut: Cut) -> Bool[np.ndarray, "t y x"]:
-    """Masks [t 240 320] bool as the model sees them: [t height width]."""
+    """Resize masks [t 240 320] bool to the model's size [t height width]."""
     pictures = to_model_size(mask[..., None].astype(np.uint8) * 255, cut.height, cut.width)
     return pictures.reshape(len(mask), cut.height, cut.width) > 127
 
 
 def read_frames(path: Path, wanted: set[int]) -> dict[int, np.ndarray]:
-    """Read frames of a video by number, each uint8 [h w 3]. Raises EpisodeError if it does not hold them."""
+    """Read frames of a video by index, each uint8 [h w 3]. Raises EpisodeError if it does not hold them."""
     frames: dict[int, np.ndarray] = {}
     try:
         with open_video(path) as container:
@@ -243,7 +243,7 @@ def read_frames(path: Path, wanted: set[int]) -> dict[int, np.ndarray]:
         frames = {}
     if len(frames) < len(wanted):
         raise EpisodeError(
-            f"{path} is missing, damaged or shorter than its episode; make its videos by `python -m xew.sim_warp.inspect DATA"
+            f"{path} is missing, damaged or shorter than its episode; make its videos with `python -m xew.sim_warp.inspect DATA"
             " --render`, or delete the episode and generate it again."
         )
     return frames

@@ -1,9 +1,9 @@
-"""The report of an autoencoder: its ceilings for every robot and every stream of pictures, and pictures of both.
+"""The report of an autoencoder: its ceilings for every robot and stream of pictures, and contact sheets.
 
 Reads  a codec, episodes
-Writes <out>/report.md, <out>/pictures/ROBOT-STREAM.png (true above decoded), and what goes into the file beside the weights
+Writes <out>/report.md, <out>/pictures/ROBOT-STREAM.png (ground truth above reconstruction), and rows for autoencoder.json
 
-It is measured on robots that were not trained on, and on a few that were; on training seeds unless test seeds are asked for.
+It measures held-out robots and a few training robots, on training seeds unless `report.test_seeds` is set.
 """
 
 import math
@@ -33,23 +33,23 @@ from xew.protocol import expand_robots
 
 @dataclass(frozen=True)
 class Quality:
-    """What a codec leaves of one stream of one robot, at the camera's size; means over clips."""
+    """Reconstruction of one stream of one robot at the camera's size, mean over clips."""
 
     robot: str
     stream: str
     trained: bool
-    """Whether the robot was trained on."""
+    """Whether it is a training robot."""
     psnr: float
     """Mean PSNR [dB]."""
     lpips: float
     """Mean LPIPS on every third frame."""
     region_psnr: float | None
-    """Mean PSNR [dB] of the robot's pixels, or of what is drawn on a blank ground; None where there are none."""
+    """Mean PSNR [dB] of the robot's pixels, or of the pixels that differ from the background; None if there are none."""
     clips: int
 
 
 class Truth(NamedTuple):
-    """A clip to be measured on."""
+    """A true clip."""
 
     video: UInt8[np.ndarray, "t 240 320 3"]
     region: Bool[np.ndarray, "t 240 320"]
@@ -57,25 +57,25 @@ class Truth(NamedTuple):
 
 
 def choose_robots(experiment: CodecExperiment, dataset: Dataset) -> list[str]:
-    """Robots to report on: those asked for, or all that were not trained on; then a few that were."""
+    """Robots of the report: the config's, by default all held-out ones, then a few training robots."""
     seeds, trained = experiment.report.seeds, experiment.train_robots
-    everybody = {record.robot for _, record in dataset.cells}
-    present = sorted({record.robot for _, record in select_unpaired(dataset, everybody, seeds)})
-    asked = expand_robots(experiment.report.robots) or tuple(robot for robot in present if robot not in trained)
+    robots = {record.robot for _, record in dataset.cells}
+    present = sorted({record.robot for _, record in select_unpaired(dataset, robots, seeds)})
+    measured = expand_robots(experiment.report.robots) or tuple(robot for robot in present if robot not in trained)
     few = choose_evenly([robot for robot in present if robot in trained], experiment.report.trained_robots)
-    return [robot for robot in dict.fromkeys((*asked, *few)) if robot in present]
+    return [robot for robot in dict.fromkeys((*measured, *few)) if robot in present]
 
 
 def measure_codec(experiment: CodecExperiment, codec: Codec, dataset: Dataset, pictures: Path | None = None) -> list[Quality]:
     """Ceilings of every robot and stream of an experiment.
 
     Args:
-        experiment: what was trained.
-        codec: what came of it.
+        experiment: of the codec.
+        codec: to measure.
         dataset: the episodes.
-        pictures: folder for contact sheets; none are drawn where left out.
+        pictures: folder for contact sheets, by default none.
     """
-    found = []
+    qualities = []
     seeds = experiment.report.seeds
     for robot in tqdm(choose_robots(experiment, dataset), desc="report", unit="robot"):
         episodes = choose_evenly(select_unpaired(dataset, (robot,), seeds), experiment.report.clips)
@@ -86,8 +86,8 @@ def measure_codec(experiment: CodecExperiment, codec: Codec, dataset: Dataset, p
             psnr, lpips, region = np.array(scores).T
             region_psnr = None if np.isnan(region).all() else float(np.nanmean(region))
             trained = robot in experiment.train_robots
-            found.append(Quality(robot, stream, trained, float(psnr.mean()), float(lpips.mean()), region_psnr, len(clips)))
-    return found
+            qualities.append(Quality(robot, stream, trained, float(psnr.mean()), float(lpips.mean()), region_psnr, len(clips)))
+    return qualities
 
 
 def read_truths(episodes: Sequence[Episode], streams: Sequence[str], frames: int) -> dict[str, list[Truth]]:
@@ -106,7 +106,7 @@ def read_truths(episodes: Sequence[Episode], streams: Sequence[str], frames: int
 
 
 def grade(codec: Codec, truth: Truth, clip: Clip, sheet: Path | None = None) -> tuple[float, float, float]:
-    """PSNR [dB], LPIPS and PSNR of the region [dB] of one clip after the codec; the last is NaN where there is no region."""
+    """PSNR [dB], LPIPS and PSNR of the region [dB] of one clip after the codec; the last is NaN without a region."""
     from xew.metrics import lpips, psnr
 
     video = truth.video
@@ -124,7 +124,7 @@ def grade(codec: Codec, truth: Truth, clip: Clip, sheet: Path | None = None) -> 
 
 
 def write_sheet(path: Path, truth: UInt8[np.ndarray, "t h w 3"], decoded: UInt8[np.ndarray, "t h w 3"]) -> None:
-    """Write a few frames of two videos [t h w 3] as a picture, true above decoded."""
+    """Write a few frames of two videos [t h w 3] as a picture, ground truth above reconstruction."""
     write_bytes(path, encode_png(strip(truth, decoded)))
 
 
@@ -147,7 +147,7 @@ def write_report(qualities: Sequence[Quality], experiment: CodecExperiment) -> s
 
 
 def spread_lines(qualities: Sequence[Quality]) -> list[str]:
-    """For each stream the worst and the best of the robots that were not trained on, one line each."""
+    """The worst and best held-out robot of each stream, one line each."""
     lines = []
     for stream in dict.fromkeys(q.stream for q in qualities):
         new = [q for q in qualities if q.stream == stream and not q.trained]
@@ -161,7 +161,7 @@ def spread_lines(qualities: Sequence[Quality]) -> list[str]:
 
 
 def report_scalars(qualities: Sequence[Quality]) -> Mapping[str, float]:
-    """The ceilings by names for a log."""
+    """The ceilings by name, for a log."""
     named = {f"ceiling/{q.robot}/{q.stream}": q for q in qualities}
     psnr = {f"{name}/psnr": q.psnr for name, q in named.items()}
     return psnr | {f"{name}/lpips": q.lpips for name, q in named.items()}

@@ -1,7 +1,6 @@
-"""Samples of a training in an order that depends on the seed and the step alone, and the clock of a training with a budget.
+"""Training samples in an order that depends only on the seed and the step, and the clock of a run with a time budget.
 
-Reads  `Pictures`
-Writes `Batch`, without decoding anything: clips are picked on the device where they fit there, else in threads ahead
+Clips are picked on the device if they fit there, otherwise ahead in threads.
 """
 
 import itertools
@@ -22,44 +21,40 @@ from xew.concurrency import map_in_order
 THREADS = 4
 """Number of threads that pick clips in the host's memory."""
 PROBES = 16
-"""Number of clips that are compared after they were put on a device."""
+"""Number of clips that are verified after copying them to a device."""
 
 
 class Batch(NamedTuple):
-    """What one step takes."""
+    """Input of one step."""
 
     clips: Any
     """[b t h w 3] uint8."""
     regions: Any
-    """[b k h w] uint8, one bit a frame, or None."""
+    """[b k h w] uint8, one bit per frame, or None."""
     rate: Any
     """[] float32, the learning rate."""
 
 
 class Clock:
-    """Time that a training has taken, what it took before an interruption included.
-
-    Args:
-        before: time [s] that passed before.
-    """
+    """Training time of a run, including the time `before` an interruption [s]."""
 
     def __init__(self, before: float = 0.0) -> None:
         self.before, self.begin = before, float("nan")
 
     def start(self) -> None:
-        """Begin to count, unless that was done before."""
+        """Start the clock unless it runs."""
         if math.isnan(self.begin):
             self.begin = perf_counter()
 
     @property
     def elapsed(self) -> float:
-        """Time [s] until now."""
+        """Training time [s]."""
         return self.before + (0.0 if math.isnan(self.begin) else perf_counter() - self.begin)
 
 
 @dataclass(frozen=True)
 class Schedule:
-    """The learning rate, and when a training ends: by its steps, or by its time."""
+    """Learning rate and end of a run, by steps or by time."""
 
     settings: CodecTrainSettings
 
@@ -77,10 +72,7 @@ class Schedule:
 
 
 def place_pictures(pictures: Pictures, share: float) -> Pictures:
-    """Put the pictures into the device's memory where they take at most a share of it; else leave them where they are.
-
-    What was put there is compared with what was sent, in a few places.
-    """
+    """Copy the pictures to the device if they take at most a share of its memory; some are verified after copying."""
     device = jax.local_devices()[0]
     memory = (device.memory_stats() or {}).get("bytes_limit", 0) if device.platform != "cpu" else 0
     size = pictures.clips.nbytes + (0 if pictures.regions is None else pictures.regions.nbytes)
@@ -96,17 +88,17 @@ def place_pictures(pictures: Pictures, share: float) -> Pictures:
 
 @jax.jit
 def pick_on_device(clips: jax.Array, numbers: jax.Array) -> jax.Array:
-    """Clips [b ...] of all [n ...] by their numbers [b]."""
+    """Select clips [b ...] of all [n ...] by index [b]."""
     return jnp.take(clips, numbers, axis=0, mode="clip")
 
 
 class Batches(Iterator[Batch]):
-    """Endless batches; `get_state` and `set_state` carry their position, as the loop of training asks for.
+    """Endless batches, with `get_state` and `set_state` of their position.
 
     Args:
         pictures: in the host's memory or on a device.
-        shares: stream -> share of the samples; streams without pictures have none.
-        settings: of the training.
+        shares: stream -> share of the samples; streams without pictures are ignored.
+        settings: of the run.
     """
 
     def __init__(self, pictures: Pictures, shares: Mapping[str, float], settings: CodecTrainSettings) -> None:
@@ -120,20 +112,20 @@ class Batches(Iterator[Batch]):
 
     @property
     def on_device(self) -> bool:
-        """Whether the pictures lie on a device."""
+        """Whether the pictures are on a device."""
         return isinstance(self.pictures.clips, jax.Array)
 
     def numbers(self, step: int) -> np.ndarray:
-        """Numbers [b] int32 of the clips of a step: a stream by the shares, then any of its clips."""
+        """Indices [b] int32 of the clips of a step: a stream by the shares, then a random clip of it."""
         rng = np.random.default_rng((self.settings.seed, step))
         streams = rng.choice(len(self.ranges), self.settings.batch, p=self.probabilities)
-        places = rng.random(self.settings.batch)
+        fractions = rng.random(self.settings.batch)
         lengths, firsts = (np.array([pick(r) for r in self.ranges]) for pick in (len, lambda r: r.start))
-        return (firsts[streams] + (places * lengths[streams]).astype(np.int64)).astype(np.int32)
+        return (firsts[streams] + (fractions * lengths[streams]).astype(np.int64)).astype(np.int32)
 
     def __next__(self) -> Batch:
         if not self.first:
-            self.clock.start()  # the first step compiles, which is no training
+            self.clock.start()  # after the first step, which compiles
         self.first = False
         if self.on_device:
             clips, regions = self.pick(self.step)
@@ -146,24 +138,24 @@ class Batches(Iterator[Batch]):
         return Batch(clips, regions, rate)
 
     def pick(self, step: int) -> tuple[Any, Any]:
-        """Clips [b t h w 3] uint8 of a step and the robot's pixels in them, [b k h w] uint8 or None."""
+        """Clips [b t h w 3] uint8 of a step and their masks of the robot, [b k h w] uint8 or None."""
         clips, regions, numbers = self.pictures.clips, self.pictures.regions, self.numbers(step)
         if self.on_device:
             return pick_on_device(clips, numbers), None if regions is None else pick_on_device(regions, numbers)
         return clips[numbers], None if regions is None else regions[numbers]
 
     def rate(self, step: int) -> float:
-        """Learning rate of the step after `step` steps, now."""
+        """Learning rate of the next step after `step` steps."""
         return self.schedule.rate(step, self.clock.elapsed)
 
     def is_over(self, step: int) -> bool:
-        """Whether the training is at its end after `step` steps, now."""
+        """Whether the run is complete after `step` steps."""
         return self.schedule.is_over(step, self.clock.elapsed)
 
     def get_state(self) -> dict[str, Any]:
-        """The position: the step that comes next, and the time [s] that has passed."""
+        """The position: the next step, and the training time [s]."""
         return {"step": self.step, "seconds": self.clock.elapsed}
 
     def set_state(self, state: Mapping[str, Any]) -> None:
-        """Go on from a position."""
+        """Continue from a position."""
         self.step, self.clock, self.ahead, self.first = int(state["step"]), Clock(float(state["seconds"])), None, True

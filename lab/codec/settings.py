@@ -20,46 +20,46 @@ SMALLEST_SIDE = 32
 
 @dataclass(frozen=True)
 class PictureSettings:
-    """Which frames are learned from, and where they are kept."""
+    """Selection and storage of the training frames."""
 
     every: int = 3
-    """Clips are taken one after another, each `every`-th of them; 1 takes all of a video."""
+    """Interval of the consecutive clips that are taken; 1 takes all."""
     drawn_every: int = 1
-    """Number of episodes of which one's drawn streams (optical flow, mask, ray map) are taken; drawing is slow."""
+    """Interval of the episodes whose drawn streams (optical flow, mask, ray map) are taken, because drawing is slow."""
     device_share: float = 0.4
-    """Largest share of an accelerator's memory that the pictures may take; where they take more, they stay in the host's."""
+    """Largest share of an accelerator's memory for the pictures; larger ones stay in the host's memory."""
     host_gb: float = 64.0
-    """Largest size of all pictures together [GB]; more is an error before anything is decoded."""
+    """Largest size of all pictures together [GB]."""
 
 
 @dataclass(frozen=True)
 class CodecTrainSettings:
-    """How the autoencoder learns. A sample is a clip."""
+    """Training of the autoencoder. A sample is a clip."""
 
     batch: int
     """Number of samples of a step, over all devices."""
     steps: int = 0
-    """Number of steps; 0 where `seconds` gives the length."""
+    """Number of steps; 0 if `seconds` sets the length."""
     seed: int = 0
     learning_rate: float = 1e-3
     """Peak of the learning rate."""
     warmup_steps: int = 200
-    """Number of steps in which the learning rate rises to its peak."""
+    """Number of steps of linear warm-up."""
     decay_to: float = 0.02
-    """Cosine decay of the learning rate to this part of its peak at the end; 1 keeps it constant."""
+    """Final learning rate of the cosine decay relative to its peak; 1 keeps it constant."""
     weight_decay: float = 0.01
     clip_norm: float = 1.0
     """Largest global norm of the gradients; larger ones are scaled down to it."""
     ema_decay: float = 0.998
-    """Decay of the moving average of the parameters; 0 keeps none."""
+    """Decay of the exponential moving average of the parameters; 0 keeps none."""
     log_every: int = 50
     save_every: int = 2000
     sample_every: int = 2000
-    """Number of steps between samples of what has been learned; 0 draws none."""
+    """Number of steps between sample reconstructions; 0 disables them."""
     keep_checkpoints: int = 1
     seconds: float = 0.0
-    """Time [s] of training after the first step, which compiles; give this or `steps`. The rate follows the time. What has
-    passed before an interruption counts."""
+    """Training time [s] after the first step, including time before an interruption; 0 if `steps` sets the length. The learning
+    rate follows the time."""
     l1: float = 1.0
     """Weight of the mean absolute difference, on a scale of -1 to 1."""
     mse: float = 2.0
@@ -67,7 +67,7 @@ class CodecTrainSettings:
     lpips: float = 0.2
     """Weight of LPIPS."""
     lpips_frames: int = 1
-    """Number of frames of each clip for LPIPS, drawn at each step; 0 for all."""
+    """Number of random frames of each clip for LPIPS; 0 takes all."""
     penalty: float = 1e-3
     """Weight of the latents' mean square."""
     noise: float = 0.1
@@ -75,57 +75,56 @@ class CodecTrainSettings:
     region: float = 0.0
     """Additional weight of the robot's pixels in l1 and mse."""
     still: float = 0.1
-    """Share of samples that show one frame of the clip at all times, as a codec's first group does."""
+    """Share of samples that repeat one frame, as the codec's first group."""
     permute: float = 0.25
-    """Share of samples whose color channels change places."""
+    """Share of samples with permuted color channels."""
     flip: bool = False
     """Whether half of the samples are mirrored."""
     jitter: float = 0.0
     """Largest change of a color channel's gain and offset, in half of the samples, on a scale of -1 to 1."""
     statistics_clips: int = 2048
-    """Number of clips from which the mean and deviation of the latents are computed at the end."""
+    """Number of clips for the mean and standard deviation of the latents."""
 
 
 @dataclass(frozen=True)
 class ReportSettings:
-    """What the report at the end is measured on: training seeds of robots that were not trained on, unless asked otherwise."""
+    """Data of the final report."""
 
     clips: int = 4
     """Number of clips of each robot and stream."""
     trained_robots: int = 3
-    """Number of training robots that are measured in addition."""
+    """Number of training robots to measure."""
     robots: tuple[str, ...] = ()
-    """Further robots to measure; default: all that are not trained on."""
+    """Other robots to measure (default: all held-out ones)."""
     test_seeds: bool = False
-    """Whether test seeds are read, and not training seeds."""
+    """Measure test seeds instead of training seeds."""
     pictures: bool = True
-    """Whether contact sheets are drawn."""
+    """Draw contact sheets."""
 
     @property
     def seeds(self) -> Seeds:
-        """Family of the seeds that are read."""
+        """Seed family."""
         return "test" if self.test_seeds else "train"
 
 
 @dataclass(frozen=True)
 class CodecExperiment:
-    """What lab/codec/*.yaml hold."""
+    """The config of a codec (lab/codec/*.yaml)."""
 
     data: Path
     """Episodes, made by `python -m xew.sim_warp.generate`."""
     out: Path
     clip: Clip
-    """Clip of the world model that is to use it: the size of the pictures, and what the report is measured on."""
+    """Clip of the world model: the size of the pictures and of the clips in the report."""
     train: CodecTrainSettings
     size: str = "base"
     """Size of the autoencoder, one of AUTOENCODERS."""
     robots: tuple[str, ...] = ()
-    """Training robots by name (`body:0-63` for 64 procedural bodies); default: the robots of `split`."""
+    """Training robots (`body:0-63` names 64 procedural bodies; default: of `split`)."""
     split: str = "fixed"
-    """Split, one of protocol.SPLITS, whose training robots are learned from where no robots are named; it names the kind of
-    motion, too."""
+    """One of protocol.SPLITS, which gives the kind of motion and the default training robots."""
     streams: dict[str, float] = field(default_factory=lambda: {"rgb": 4.0, "robot_render": 2.0, "optical_flow": 1.0})
-    """Share of the samples that each stream of pictures has, by name: the scene, and conditions that are pictures."""
+    """Share of the samples of each stream of pictures (rgb and picture conditions)."""
     dtype: Literal["float32", "bfloat16"] = "float32"
     """Type of the activations."""
     pictures: PictureSettings = field(default_factory=PictureSettings)
@@ -138,17 +137,17 @@ class CodecExperiment:
 
     @property
     def train_robots(self) -> tuple[str, ...]:
-        """Keys of the robots that are learned from."""
+        """Keys of the training robots."""
         return expand_robots(self.robots) or pick(SPLITS, self.split, "split").train_robots
 
     @property
     def motion(self) -> str:
-        """Kind of motion of the episodes that are learned from, as the split names it."""
+        """Kind of motion of the training episodes."""
         return pick(SPLITS, self.split, "split").motion
 
     @property
     def cut(self) -> Cut:
-        """What is cut out of a video."""
+        """Cutting of the training videos."""
         return Cut(TEMPORAL_FACTOR, self.pictures.every, self.clip.height, self.clip.width, self.pictures.drawn_every)
 
 
@@ -176,16 +175,16 @@ LEAST = LEAST_OF_STEPS | {
     "report.clips": 1,
     "report.trained_robots": 0,
 }
-"""Numbers of a config that mean nothing below."""
+"""Least values of a config's settings."""
 
 
 def load_codec_experiment(path: Path | str, overrides: Sequence[str] = ()) -> CodecExperiment:
-    """Read and check a config. Raises ConfigError with what does not exist or does not fit."""
+    """Read and check a config. Raises ConfigError for a setting that does not exist or does not fit."""
     return check_codec_experiment(load(CodecExperiment, path, overrides), path)
 
 
 def check_codec_experiment(experiment: CodecExperiment, path: Path | str) -> CodecExperiment:
-    """The experiment itself. Raises ConfigError, naming its path, if one of its choices does not exist or does not fit."""
+    """Return the experiment. Raises ConfigError, naming its path, for a setting that does not exist or does not fit."""
     check_least(LEAST, experiment, str(path))
     check_streams(experiment.streams)
     _ = experiment.train_robots
@@ -206,11 +205,11 @@ def check_codec_experiment(experiment: CodecExperiment, path: Path | str) -> Cod
 
 
 def check_streams(streams: dict[str, float]) -> None:
-    """Raise ConfigError unless every name is a stream of pictures with a share of at least 0, and one has more."""
+    """Raise ConfigError unless every name is a stream of pictures with a share of at least 0, one of them positive."""
     known = (*ALIGNED, *UNALIGNED)
     for name, share in streams.items():
         pick(dict.fromkeys(known, ""), name, "stream of pictures")
         if not share >= 0:
             raise ConfigError(f"streams: {name} has the share {share:g}; it must be at least 0.")
     if not any(streams.values()):
-        raise ConfigError(f"streams names none with a share over 0; name some of {', '.join(known)}.")
+        raise ConfigError(f"streams has no share over 0; expected one for some of {', '.join(known)}.")

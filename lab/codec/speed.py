@@ -1,8 +1,8 @@
-"""The shipped codec compared with Wan2.2's autoencoder: encoding and decoding equal clips of 320x256, in one run on one device.
+"""Speed of the packaged codec compared with Wan2.2's autoencoder on the same clips of 320x256 and the same device.
 
     python -m lab.codec.speed [--frames 33] [--clips 4] [--rounds 5] [--dtype bfloat16] [--wan wan22]
 
-Weights are random on both sides: time does not depend on them. Exits with 1 where a ratio is under the limit (3).
+Weights are random. Exits with 1 if a ratio is below the limit (3).
 """
 
 import statistics
@@ -32,11 +32,11 @@ class Args:
     ours: str = "base"
     wan: str = "wan22"
     limit: float = 3.0
-    """Ratio that is asked for."""
+    """Least ratio of the times."""
 
 
 def median_seconds(call: Callable[..., jax.Array], *given: Any, rounds: int, shape: tuple[int, ...]) -> float:
-    """Median time [s] of a call, after two that compile; what it gives has this shape and is finite."""
+    """Median time [s] of a call, after two warm-up calls; checks that the result has this shape and is finite."""
     for _ in range(2):
         out = jax.block_until_ready(call(*given))
     assert out.shape == shape, (out.shape, shape)

@@ -1,8 +1,4 @@
-"""One step of training an autoencoder: what is done to the samples, the loss, its gradients, the update; compiled.
-
-Reads  `TrainState`, `Batch`
-Writes the next `TrainState`, `Losses`
-"""
+"""One compiled training step of an autoencoder: augmentation, loss, gradients, update."""
 
 import functools
 from collections.abc import Callable, Sequence
@@ -43,7 +39,7 @@ class Losses(NamedTuple):
 
 
 def unpack_regions(regions: UInt8[Array, "b bytes h w"], frames: int) -> Float[Array, "b t h w 1"]:
-    """The robot's pixels [b t h w 1] float32, 1 or 0, of bits [b k h w], one a frame from the highest on."""
+    """Unpack masks [b k h w], one bit per frame from the highest on, to [b t h w 1] float32, 1 or 0."""
     parts = [(regions[:, time // 8] >> np.uint8(7 - time % 8)) & np.uint8(1) for time in range(frames)]
     return jnp.stack(parts, axis=1)[..., None].astype(jnp.float32)
 
@@ -51,7 +47,7 @@ def unpack_regions(regions: UInt8[Array, "b bytes h w"], frames: int) -> Float[A
 def augment(
     keys: Key[Array, " b"], clips: Clips, regions: Float[Array, "b t h w 1"], settings: CodecTrainSettings
 ) -> tuple[Float[Array, "b t y x 3"], Float[Array, "b t y x 1"]]:
-    """Clips [b t h w 3] in [-1, 1] and the robot's pixels [b t h w 1] as they are shown: see `CodecTrainSettings`."""
+    """Augment clips [b t h w 3] in [-1, 1] and masks of the robot [b t h w 1], see `CodecTrainSettings`."""
     return jax.vmap(functools.partial(_augment_one, settings))(keys, clips, regions)
 
 
@@ -79,7 +75,7 @@ def _augment_one(settings: CodecTrainSettings, key: Array, clip: Array, region: 
 
 
 def reconstruct_groups(module: ConvAutoencoder, groups: Clips, key: Key[Array, ""], noise: float) -> tuple[Clips, Array]:
-    """Groups [b 4 h w 3] after noise on their latents, not clipped, and the latents' mean square."""
+    """Reconstruct groups [b 4 h w 3] from noisy latents, not clipped; returns them and the latents' mean square."""
     latents = module.encode_groups(groups)
     noisy = latents + noise * jax.random.normal(key, latents.shape, latents.dtype)
     return module.decode_groups(noisy), jnp.square(latents).mean()
@@ -88,8 +84,8 @@ def reconstruct_groups(module: ConvAutoencoder, groups: Clips, key: Key[Array, "
 def codec_losses(
     module: ConvAutoencoder, clips: Clips, weights: Float[Array, "b t h w 1"], key: Key[Array, ""], settings: CodecTrainSettings
 ) -> Losses:
-    """The loss of clips [b t h w 3] in [-1, 1], whose pixels have these weights [b t h w 1] in l1 and mse."""
-    from xew.metrics import lpips  # imported here: metrics are needed for the loss alone
+    """The loss of clips [b t h w 3] in [-1, 1], with weights [b t h w 1] of pixels in l1 and mse."""
+    from xew.metrics import lpips
 
     latent_key, frame_key = jax.random.split(key)
     decoded, penalty = reconstruct_groups(module, clips, latent_key, settings.noise)
@@ -98,16 +94,16 @@ def codec_losses(
     l1, mse = (weights * jnp.abs(difference)).sum() / norm, (weights * jnp.square(difference)).sum() / norm
     perceptual = jnp.float32(0)
     if settings.lpips:
-        made, true = (_some_frames(x, frame_key, settings.lpips_frames) for x in (decoded, clips))
-        at_once = len(made) if jax.default_backend() == "gpu" else max(len(made) // len(clips), 1)
-        perceptual = lpips(made, true, chunk=at_once, exact=False).mean()
+        frames, truth = (_some_frames(x, frame_key, settings.lpips_frames) for x in (decoded, clips))
+        chunk = len(frames) if jax.default_backend() == "gpu" else max(len(frames) // len(clips), 1)
+        perceptual = lpips(frames, truth, chunk=chunk, exact=False).mean()
     psnr = -10 * jnp.log10(jnp.square((jnp.clip(decoded, -1, 1) - clips) / 2).mean() + 1e-10)
     total = settings.l1 * l1 + settings.mse * mse + settings.lpips * perceptual + settings.penalty * penalty
     return Losses(total, l1, mse, perceptual, penalty, psnr, jnp.float32(0), jnp.isfinite(total))
 
 
 def _some_frames(clips: Array, key: Array, count: int) -> Array:
-    """Frames [n h w 3] in [0, 1], at the same few times drawn at random of each clip [b t h w 3]; all where count is 0."""
+    """Frames [n h w 3] in [0, 1] of clips [b t h w 3] at `count` random times, the same for all clips; 0 takes all."""
     frames = clips.shape[1]
     if 0 < count < frames:
         clips = jnp.take(clips, jax.random.choice(key, frames, (count,), replace=False), axis=1)
@@ -115,7 +111,7 @@ def _some_frames(clips: Array, key: Array, count: int) -> Array:
 
 
 def make_codec_optimizer(settings: CodecTrainSettings) -> optax.GradientTransformation:
-    """AdamW after clipping by the global norm, without the learning rate, which each step is given."""
+    """AdamW after clipping by the global norm, without the learning rate, an input of each step."""
     return optax.chain(
         optax.clip_by_global_norm(settings.clip_norm),
         optax.scale_by_adam(),
@@ -126,7 +122,7 @@ def make_codec_optimizer(settings: CodecTrainSettings) -> optax.GradientTransfor
 def make_codec_step(
     graph: nnx.GraphDef, statistics: Any, experiment: CodecExperiment
 ) -> Callable[[TrainState, Batch], tuple[TrainState, Losses]]:
-    """The compiled step; its noise depends on the seed and the step alone: a resumed run repeats it."""
+    """The compiled step; its noise depends only on the seed and the step, so a resumed run repeats it."""
     settings, optimizer = experiment.train, make_codec_optimizer(experiment.train)
 
     @functools.partial(jax.jit, donate_argnums=0)
@@ -148,7 +144,7 @@ def make_codec_step(
         (_, losses), gradients = jax.value_and_grad(loss, has_aux=True)(state.params)
         updates, moments = optimizer.update(gradients, state.optimizer, state.params)
         params = optax.apply_updates(state.params, jax.tree.map(lambda update: -batch.rate * update, updates))
-        # The average of few steps is over those alone; else the random start would stay in it.
+        # A shorter average over the first steps, to forget the random start.
         decay = jnp.minimum(settings.ema_decay, (1 + state.step) / (10 + state.step))
         ema = optax.incremental_update(params, state.ema, 1 - decay)
         norm = optax.tree.norm(gradients)
@@ -159,8 +155,8 @@ def make_codec_step(
 
 
 def init_codec_state(experiment: CodecExperiment) -> tuple[nnx.GraphDef, Any, TrainState]:
-    """Structure, statistics of the latents (0 and 1 until the end) and the state of step 0."""
-    key = jax.random.key(experiment.train.seed, impl="unsafe_rbg")  # the other kinds take a minute to compile
+    """Structure, initial statistics of the latents (0 and 1) and the state of step 0."""
+    key = jax.random.key(experiment.train.seed, impl="unsafe_rbg")  # other generators take a minute to compile
 
     def create() -> nnx.Module:
         return ConvAutoencoder(experiment.autoencoder, dtype=jnp.dtype(experiment.dtype), rngs=nnx.Rngs(key))

@@ -1,4 +1,4 @@
-"""Choosing the episodes of a data set that an autoencoder is trained or measured on, which needs no pairs of robots."""
+"""Selection of episodes to train or measure an autoencoder, without pairing over robots."""
 
 from collections.abc import Collection, Sequence
 from typing import Literal
@@ -8,14 +8,11 @@ from xew.model.episodes.choice import explain_missing_robots
 from xew.protocol import seed_split
 
 Seeds = Literal["train", "test"]
-"""A family of seeds that a codec is trained or measured on."""
+"""Seed family."""
 
 
 def select_unpaired(dataset: Dataset, robots: Collection[str], seeds: Seeds) -> list[Episode]:
-    """Episodes with pictures of some robots and a family of seeds, sorted; possibly none.
-
-    Seeds at which another robot has failed count too where this one's pictures are there.
-    """
+    """Sorted episodes with videos of some robots and a seed family, including seeds at which another robot failed."""
     return [
         (folder, record)
         for folder, record in dataset.cells
@@ -24,11 +21,11 @@ def select_unpaired(dataset: Dataset, robots: Collection[str], seeds: Seeds) -> 
 
 
 def unpaired_training_episodes(dataset: Dataset, robots: Sequence[str], motion: str) -> list[Episode]:
-    """Episodes with pictures of training seeds of some robots.
+    """Episodes with videos of training seeds of some robots.
 
     Raises:
-        ConfigError: there is none at all.
-        EpisodeError: some are of another kind of motion.
+        ConfigError: there are none.
+        EpisodeError: some have another kind of motion.
     """
     episodes = select_unpaired(dataset, robots, "train")
     if not episodes:

@@ -267,7 +267,7 @@ def test_what_the_user_admits_is_imported(own: Path, evil: Path) -> None:
     with pytest.raises(ConfigError, match="is a NoneType; expected a Task"):
         find_problem(own)
     assert evil.exists()
-    with pytest.raises(ConfigError, match="is no name of a module"):
+    with pytest.raises(ConfigError, match="is not a module name"):
         config.admit(["a b"])
     config.demand_admitted({"a": ["evil_data:X", "evil_data.evil.below:X"]}, "a file")
     with pytest.raises(UntrustedError):

@@ -12,7 +12,7 @@ import pytest
 from xew import config
 from xew.config import ConfigError
 from xew.model import train
-from xew.model.experiment import beside, load_experiment
+from xew.model.experiment import Experiment, load_experiment
 from xew.model.rollout import default_name, is_config
 
 REPOSITORY = Path(__file__).parents[2]
@@ -84,7 +84,7 @@ def test_a_config_changes_its_base(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("base: config.yaml", "has the base config.yaml; name that, since there is one level only"),
+        ("base: config.yaml", "has the base config.yaml; bases cannot be nested"),
         ("base: nowhere.yaml", "cannot read the config .*nowhere.yaml"),
         ("base: 3", "base is 3; expected the path of a config"),
         ("base: xew:fixd", "did you mean 'fixed'"),
@@ -103,7 +103,7 @@ def test_all_mistakes_at_once(tmp_path: Path) -> None:
 
 def test_missing_file_lists_what_there_is(tmp_path: Path) -> None:
     write(tmp_path, "name: x")
-    with pytest.raises(ConfigError, match=r"cannot read the config .*There is: .*config\.yaml"):
+    with pytest.raises(ConfigError, match=r"cannot read the config .*The folder has .*config\.yaml"):
         config.load(Outer, tmp_path / "other.yaml")
 
 
@@ -181,7 +181,7 @@ LOST = Condition("lost", "embodimnt", robot_render)
     ("action", "said"),
     [
         ("SYSTEM", "still and robot_render both feed embodiment"),
-        ("LOST", "the condition lost feeds 'embodimnt'; conditions feed action, embodiment"),
+        ("LOST", "the condition lost feeds 'embodimnt'; expected one of action, embodiment"),
     ],
 )
 def test_conditions_that_would_not_reach_the_network_are_told(
@@ -214,13 +214,13 @@ def test_bodies_to_adapt_to_are_named_one_by_one_and_not_replayed(tmp_path: Path
     assert choice.robots == ("body_1", "body_2") and choice.replay == ("body_0", "body_3")
 
 
-def test_what_lies_beside_the_data_does_so_wherever_one_stands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_cache_lies_next_to_the_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "data" / "task").mkdir(parents=True)
     monkeypatch.chdir(tmp_path / "data" / "task")
-    assert beside(Path(".."), "latents") == (tmp_path / "data-latents").resolve()
+    assert Experiment(Path(".."), Path("run")).cache_folder == (tmp_path / "data-latents").resolve()
     monkeypatch.chdir(tmp_path / "data")
-    assert beside(Path("."), "latents") == (tmp_path / "data-latents").resolve()
-    assert beside(Path("data"), "latents") == Path("data-latents")
+    assert Experiment(Path("."), Path("run")).cache_folder == (tmp_path / "data-latents").resolve()
+    assert Experiment(Path("data"), Path("run")).cache_folder == Path("data-latents")
 
 
 @pytest.mark.parametrize(

@@ -84,7 +84,7 @@ def test_mistakes_are_told(run: Path, released: Path, tmp_path: Path, capsys: py
     for arguments, said in (
         ([str(run), "--out", str(released)], "holds a run already"),
         ([str(tmp_path), "--out", str(tmp_path / "out")], "holds no run"),
-        ([str(run), "--out", str(tmp_path / "out"), "--scores", str(tmp_path / "none.md")], "is no file"),
+        ([str(run), "--out", str(tmp_path / "out"), "--scores", str(tmp_path / "none.md")], "is not a file"),
     ):
         with pytest.raises(SystemExit) as stopped:
             release.main(arguments)

@@ -248,7 +248,7 @@ def test_mistakes_end_in_one_clear_error(
 
 
 def test_rollouts_never_take_the_place_of_episodes(world: Path, published: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert "rollouts would replace them" in refusal([str(published), "--out", str(world / "data")], capsys)
+    assert "the folder of the episodes" in refusal([str(published), "--out", str(world / "data")], capsys)
     assert choose_tests(world / "data")
 
 

@@ -122,7 +122,7 @@ def test_what_a_system_needs_and_lacks_is_an_error(world: Path, tmp_path: Path, 
     said = capsys.readouterr().err
     assert stop.value.code == 2 and "scales of grouped_tool_poses" in said and "python -m xew.model.latents" in said
     assert not (tmp_path / "run").exists()
-    with pytest.raises(ConfigError, match=r"model.history is \[-10, 0\]; give frames before the clip"):
+    with pytest.raises(ConfigError, match=r"model.history is \[-10, 0\]; expected negative frames"):
         load_experiment(config, ["--model.history", "-10", "0"])
     with pytest.raises(ConfigError, match="one_way computes earlier frames without the poses"):
         load_experiment(world / "ctrl_world.yaml", ["--model.visibility", "one_way"])

@@ -1,7 +1,6 @@
 """Episodes -> latent cache -> checkpoint -> rollouts, on JAX, Flax NNX, Optax, Orbax and Grain.
 
-Its commands are `latents`, `train`, `rollout`, `outside`, `export` and `release`; `conditions` lists
-what the network can be conditioned on, and `experiment` reads a config.
+Commands: `latents`, `train`, `rollout`, `outside`, `export`, `release`. `conditions` lists the network's conditions.
 """
 
 __all__ = [

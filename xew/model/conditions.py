@@ -1,13 +1,13 @@
-"""What the model is conditioned on: a robot's motion (ACTIONS) and appearance (CONDITIONS), made from commands alone.
+"""Conditions of the model: a robot's motion (ACTIONS) and appearance (CONDITIONS), made from commands alone.
 
-Reads  a `Command`: which robot, its commanded joints, the camera, the robot-only render of those commands, and the first frame
+Reads  a `Command`: robot, commanded joints, camera, the robot-only render of those commands, and the scene's first frame
 Writes uint8 [t h w 3] pictures for the codec, or float32 [t n] numbers
 To add one: a function of a Command and one line in ACTIONS or CONDITIONS; from outside the repo, `module:NAME` of a
-`Condition`, or of a tuple of them. Titles and labels stand here too, and tables and figures take them from here, so this
-file imports neither JAX nor Warp when it is loaded. The last entries of ACTIONS are the paper's other systems: each is a
-combination of mechanisms (network/mechanisms.py) in the same network.
+`Condition` or of a tuple of them.
 
-A Command holds nothing that was measured or seen in the scene after its first frame, so that no condition can show the future.
+Tables and figures take titles and labels from here, so this file imports neither JAX nor Warp. The last entries of ACTIONS are
+other systems of the paper, as combinations of mechanisms (network/mechanisms.py) in the same network. A Command holds no
+measurement and no frame of the scene after the first, so no condition can show the future.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -36,7 +36,7 @@ Poses = Float[np.ndarray, "t 14"]
 
 @dataclass(frozen=True)
 class Command:
-    """Everything that a condition may be made from."""
+    """The input of a condition."""
 
     robot: str
     action: Float[np.ndarray, "t 16"]
@@ -46,13 +46,13 @@ class Command:
     extrinsics: Float[np.ndarray, "4 4"]
     """Matrix [4 4] from the world to the head camera's frame."""
     render_path: Path
-    """Path of the stored robot-only video, posed by `action` on a white ground."""
+    """Path of the robot-only video, posed by `action` on white."""
     rendered: Video | None = None
-    """The same video [t h w 3] uint8, where it is in memory."""
+    """The same video [t h w 3] uint8, if it is in memory."""
     data: Path | None = None
-    """Data set of the episode, which keeps robots of a user's own."""
+    """Data set of the episode, which may hold custom robots."""
     read_first: Callable[[], Video] | None = None
-    """Function that reads the first frame of the scene [1 h w 3] uint8, which every model is given, and no other."""
+    """Function that reads the first frame of the scene [1 h w 3] uint8."""
 
     @cached_property
     def render(self) -> Video:
@@ -61,7 +61,7 @@ class Command:
 
     @cached_property
     def streams(self) -> "xew.sim_warp.rendering.streams.CommandStreams":
-        """Render, mask and optical flow of the commands; Warp is imported when first asked for."""
+        """Render, mask and optical flow of the commands; imports Warp."""
         from xew.sim_warp.rendering.streams import command_streams
 
         return command_streams(self.robot_spec, self.action, self.camera)
@@ -75,14 +75,14 @@ class Command:
 
     @cached_property
     def robot_spec(self) -> "xew.sim_warp.embodiment.spec.RobotSpec":
-        """The simulator's description of the robot: of the registry, or stored with the data."""
+        """The simulator's robot, from the registry or stored with the data."""
         from xew.sim_warp.robots import recorded_robot
 
         return recorded_robot(self.robot, self.data)
 
     @property
     def camera(self) -> "xew.sim_warp.geometry.camera.Camera":
-        """The simulator's own camera object."""
+        """The simulator's camera."""
         from xew.sim_warp.geometry.camera import Camera
 
         return Camera(self.intrinsics, self.extrinsics)
@@ -95,70 +95,62 @@ def keep_numbers(numbers: Shaped[np.ndarray, "t n"]) -> Shaped[np.ndarray, "t n"
 
 @dataclass(frozen=True)
 class Condition:
-    """One kind of condition and where it enters the network."""
+    """One condition and its place in the network."""
 
     name: str
-    """Name in the latent cache; another content needs another name."""
+    """Unique name in the latent cache."""
     stream: str
     """A stream of the network (`dit.STREAMS`) or a mechanism (`mechanisms.MECHANISMS`)."""
     make: Callable[[Command], np.ndarray] | None
-    """Function that makes uint8 [t h w 3] or float32 [t n]. None stands for the scene's own earlier frames, which no command
-    knows."""
+    """Function that makes uint8 [t h w 3] or float32 [t n]; None for earlier frames of the scene."""
     aligned: bool = True
-    """Whether it has one frame for each frame of the episode. Else it is a short description of 4 k + 1 frames, which every
-    chunk reuses."""
+    """Whether it has one frame for each frame of the episode. Otherwise it has 4 k + 1 frames that every chunk reuses."""
     change: Callable[[np.ndarray], np.ndarray] = keep_numbers
-    """Function from the numbers of a clip's frames [t n] to what the network is given of them [t n]; a later frame changes
-    nothing of an earlier one."""
+    """Causal transform of the numbers of a clip's frames [t n] -> [t n]."""
     group: bool = False
-    """Whether a latent frame is given the numbers of its four frames [t' 4*n], or those of its last [t' n]."""
+    """Whether a latent frame gets the numbers of its four frames [t' 4*n], or of its last frame [t' n]."""
     scale: Literal["none", "percentiles", "standard"] = "none"
-    """Normalization of numbers by those of the training episodes (cache/scales.py)."""
+    """Normalization of numbers by the training episodes (cache/scales.py)."""
     with_history: bool = False
-    """Whether earlier frames (`model.history`) are given theirs too, before the clip's."""
+    """Whether numbers of the earlier frames (`model.history`) precede the clip's."""
     is_guess: bool = False
-    """Whether it is a first guess of the video itself, made of its first frame too: what a prediction of residuals
-    (`model.prediction`) then begins with, instead of the first frame."""
+    """Whether it is a first guess of the video, from which residuals (`model.prediction`) are predicted."""
     title: str = ""
-    """Name at the head of a table's row or a figure."""
+    """Name in tables and figures."""
     label: str = ""
-    """Description of what the network is given, in a few words."""
+    """Short description of the network's input."""
 
 
 @dataclass(frozen=True)
 class System:
-    """Conditions that belong together, at most one for each stream or mechanism."""
+    """A combination of conditions, at most one for each stream or mechanism."""
 
     conditions: tuple[Condition, ...]
     title: str
-    """Name at the head of a table's row or a figure."""
     label: str
-    """Description of what the network is given, in a few words."""
 
     def __iter__(self) -> Iterator[Condition]:
         return iter(self.conditions)
 
 
 def list_conditions(entry: Condition | System | Sequence[Condition]) -> tuple[Condition, ...]:
-    """The conditions of a registry's entry, or of what a user gives in its place."""
+    """The conditions of a registry entry or of a user's object."""
     return (entry,) if isinstance(entry, Condition) else tuple(entry)
 
 
 def clip_numbers(
     condition: Condition, numbers: Shaped[np.ndarray, "t n"], start: int, frames: int, history: Sequence[int] = ()
 ) -> Float32[np.ndarray, "latent_frames numbers"]:
-    """The numbers of one clip that the network is given by a condition.
+    """Numbers of one clip for the network: [t' n], or grouped [t' 4*n], float32, a row for each latent frame.
+
+    Rows of earlier frames come first if the condition has them (`with_history`).
 
     Args:
-        condition: how frames are grouped, and whether earlier ones count.
-        numbers: [t n] of the whole episode; before its start and past its end the nearest frame counts.
+        condition: grouping, transform and history.
+        numbers: [t n] of the whole episode; its first and last frame are repeated beyond its ends.
         start: first frame of the clip.
         frames: number of its frames, 4 k + 1.
-        history: earlier frames, counted from the clip's first.
-
-    Returns:
-        [t' n], or [t' 4*n] where four frames are grouped, float32: a row for each latent frame, after one for each earlier
-        frame where these count.
+        history: earlier frames, relative to the clip's first.
     """
 
     def take_frames(frames: np.ndarray) -> np.ndarray:
@@ -177,7 +169,7 @@ def clip_numbers(
 def make_command(
     folder: Path, record: Record, states: States, rendered: Video | None = None, scene: Video | None = None
 ) -> Command:
-    """The part of an episode that conditions may see; its videos [t h w 3] as of `episodes.commands.episode_command`."""
+    """The command of an episode; videos [t h w 3] as in `episodes.commands.episode_command`."""
     render, data = folder / "robot.mkv", data_folder(folder)
     first = partial(read_video, folder / "rgb.mkv", most=1) if scene is None else partial(np.copy, scene[:1])
     return Command(record.robot, states.action, states.intrinsics, states.extrinsics, render, rendered, data, first)
@@ -194,13 +186,10 @@ def robot_render(command: Command) -> Video:
 
 
 def pasted_render(command: Command) -> Video:
-    """The robot alone at every frame, pasted into the first frame of the scene: [t h w 3] uint8.
-
-    The same as the baseline of that name: what one can draw of the video without having learned anything.
-    """
+    """The robot alone at every frame, pasted into the first frame of the scene: [t h w 3] uint8, the no-learning baseline."""
     from xew.metrics.grading.baselines import paste_render
 
-    assert command.read_first is not None, "a command of an episode has it"
+    assert command.read_first is not None
     return paste_render(command.read_first()[0], command.render)
 
 
@@ -210,14 +199,14 @@ def robot_mask(command: Command) -> Video:
 
 
 def optical_flow(command: Command) -> Video:
-    """The robot's exact motion as a color wheel, white where nothing moves: [t h w 3] uint8."""
+    """The robot's exact optical flow as colors, white where nothing moves: [t h w 3] uint8."""
     from xew.sim_warp.rendering.streams import flow_to_rgb
 
     return flow_to_rgb(command.streams.optical_flow)
 
 
 def ray_map(command: Command) -> Video:
-    """The commanded tool frames drawn into the image: [t h w 3] uint8."""
+    """The commanded tool frames, drawn into the image: [t h w 3] uint8."""
     from xew.sim_warp.rendering import streams
 
     return streams.ray_map(command.robot_spec, command.action, command.camera)
@@ -245,14 +234,13 @@ def articulation_clip(command: Command) -> Video:
 
 
 POINTING_DOWN = Rotation.from_matrix([[0, -1, 0], [0, 0, 1], [-1, 0, 0]])
-"""Tool frame whose approach (x) points to the ground and whose y axis points to the left, as at home: its z axis points
-away from the robot, so that yaw is the heading."""
+"""Tool frame at home: x points to the ground, y to the left, z away from the robot, so yaw is the heading."""
 
 
 def tool_poses(command: Command) -> Poses:
     """Commanded position [m], roll, pitch, yaw [rad] and gripper of both tools, in the world: [t 14] float32.
 
-    The angles are those of the turn from `POINTING_DOWN`, where tools mostly are: there none of them jumps.
+    The angles are relative to `POINTING_DOWN`, near which none of them jumps.
     """
     sides = []
     for pose, (_, gripper) in zip(command.tools.swapaxes(0, 1), ARMS, strict=True):
@@ -273,15 +261,9 @@ RELATIVE_SCALE = 20.0
 
 
 def relative_tool_poses(poses: Poses) -> Poses:
-    """IRASim's actions: the motion since the frame before, in that frame's tool frame, times 20.
+    """IRASim's actions: the motion since the previous frame, in that frame's tool frame, times 20.
 
-    Grippers stay as they are. The first frame has no motion.
-
-    Args:
-        poses: [t 14], see `Poses`.
-
-    Returns:
-        [t 14], positions [m / 20] and angles [rad / 20].
+    Poses [t 14] (see `Poses`) -> [t 14], positions [m / 20], angles [rad / 20] and unchanged grippers; frame 0 has no motion.
     """
     before, sides = np.concatenate([poses[:1], poses[:-1]]), []
     for side in (slice(0, 7), slice(7, 14)):
@@ -294,13 +276,9 @@ def relative_tool_poses(poses: Poses) -> Poses:
 
 
 def tool_deltas(poses: Poses) -> Poses:
-    """EnerVerse-AC's actions: the change of position and angles in the world since the frame before, and the gripper.
+    """EnerVerse-AC's actions: the change of position and angles in the world since the previous frame, and the gripper.
 
-    Args:
-        poses: [t 14], see `Poses`.
-
-    Returns:
-        [t 14], positions [m] and angles [rad].
+    Poses [t 14] (see `Poses`) -> [t 14], positions [m] and angles [rad].
     """
     delta = np.diff(poses, axis=0, prepend=poses[:1])
     angles = [column for side in (0, 7) for column in range(side + 3, side + 6)]
@@ -383,5 +361,4 @@ CONDITIONS: dict[str, Condition | System] = {
     ),
 }
 HISTORY = Condition("history", "history", None, title="Earlier frames", label="earlier frames")
-"""Condition of earlier frames of the scene, sparse, each encoded alone (`model.history`): recorded ones in training,
-predicted ones in a rollout."""
+"""Sparse earlier frames of the scene (`model.history`), each encoded alone: recorded in training, predicted in a rollout."""

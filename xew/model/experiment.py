@@ -1,7 +1,7 @@
-"""The config of a world-model experiment: what configs/*.yaml hold, and the parts that it is resolved into.
+"""The config of a world-model experiment (configs/*.yaml), and its parts.
 
-The defaults are the recommended recipe, that of configs/fixed.yaml. Functions elsewhere take the part that they need
-(`Experiment.network`, `.inputs`, `.instructions`, `.encoding`, `.choice`, `.spec`) and not the whole experiment.
+The defaults are the recommended recipe of configs/fixed.yaml. Other functions take a part (`Experiment.network`, `.inputs`,
+`.instructions`, `.encoding`, `.choice`, `.spec`) and not the whole experiment.
 """
 
 import functools
@@ -35,9 +35,9 @@ class Experiment:
     data: Path
     """Episodes, made by `python -m xew.sim_warp.generate`."""
     out: Path
-    """The run: config, checkpoints, TensorBoard, samples."""
+    """Folder of the run: config, checkpoints, TensorBoard, samples."""
     split: str = "fixed"
-    """One of protocol.SPLITS: which robots train."""
+    """One of protocol.SPLITS, which gives the training robots."""
     clip: Clip = field(default_factory=Clip)
     codec: CodecSettings = field(default_factory=CodecSettings)
     model: ModelSettings = field(default_factory=ModelSettings)
@@ -46,11 +46,12 @@ class Experiment:
     adapt: AdaptSettings = field(default_factory=AdaptSettings)
     rollout: RolloutSettings = field(default_factory=RolloutSettings)
     cache: Path | None = None
-    """Encoded streams; next to the data where left out."""
+    """Folder of encoded streams; by default next to the data."""
 
     @property
     def cache_folder(self) -> Path:
-        return self.cache or beside(self.data, "latents")
+        data = self.data.resolve() if self.data.name in ("", "..") else self.data
+        return self.cache or data.with_name(f"{data.name}-latents")
 
     @property
     def robots(self) -> Split:
@@ -67,7 +68,7 @@ class Experiment:
 
     @property
     def size(self) -> ModelSize:
-        """Size of the network; the width of the text is its encoder's."""
+        """Size of the network, with the text encoder's width."""
         size, width = pick(MODELS, self.model.size, "model size"), self.text_encoder.width
         return replace(size, text_dim=width) if width else size
 
@@ -101,7 +102,7 @@ class Experiment:
 
     @property
     def choice(self) -> EpisodeChoice:
-        """Which episodes are read. Raises ConfigError if the run that is replayed has gone."""
+        """Selection of episodes. Raises ConfigError if the replayed run no longer exists."""
         adapt, targets, replay = self.adapt, expand_robots(self.adapt.robots), tuple[str, ...]()
         samples = sample_roles(self.robots, targets) if self.train.sample_every else {}
         if adapt.start_from is None:
@@ -113,12 +114,12 @@ class Experiment:
 
     @property
     def spec(self) -> TrainSpec:
-        """What is trained and how; a run whose length is in epochs gets its steps from `TrainSpec.with_steps`."""
+        """Training specification; `TrainSpec.with_steps` sets the steps of a run whose length is in epochs."""
         return TrainSpec(self.network, self.inputs, self.train, self.adapt.replay, self.adapt.lora_rank)
 
     @property
     def schedule(self) -> NoiseSchedule:
-        """Noise levels through which rollouts are sampled."""
+        """Noise schedule of rollouts."""
         make = pick(SCHEDULES, self.rollout.noise_schedule, "noise schedule")
         return make(self.rollout.steps, self.train.shift)
 
@@ -130,7 +131,7 @@ def _latent_shape(clip: Clip, codec: CodecSettings) -> tuple[int, ...]:
 
 
 def _condition_shape(latents: tuple[int, ...], condition: Condition, history: int) -> tuple[int, ...]:
-    """Shape of what a condition says of a clip of latents [t h w c]: latents [t h w c], or numbers [t n]."""
+    """Shape of a condition for a clip of latents [t h w c]: latents [t h w c], or numbers [t n]."""
     stream, (frames, *picture) = condition.stream, latents
     width = ACTION_DIM if stream == "joints" else MECHANISMS[stream].width if stream in MECHANISMS else 0
     if width:
@@ -138,28 +139,22 @@ def _condition_shape(latents: tuple[int, ...], condition: Condition, history: in
     return history if condition.make is None else frames, *picture
 
 
-def beside(data: Path, ending: str) -> Path:
-    """Name the folder next to the data that is called as they are, with an ending; also where they are "." or ".."."""
-    named = data.resolve() if data.name in ("", "..") else data
-    return named.with_name(f"{named.name}-{ending}")
-
-
 def load_experiment(path: Path | str, overrides: Sequence[str] = ()) -> Experiment:
-    """Read and check a config. Raises ConfigError with a choice that does not exist or does not fit."""
+    """Read and check a config. Raises ConfigError for a setting that does not exist or does not fit."""
     experiment = load(Experiment, path, overrides)
     check_experiment(experiment, str(path))
     return experiment
 
 
 def load_recorded(path: Path) -> Experiment:
-    """Read and check the config that a run was trained with, which may be anybody's.
+    """Read and check the config of a run, which may come from someone else.
 
     Raises:
         UntrustedError: it names a module that the user has not admitted.
         ConfigError: as `load_experiment`.
     """
     experiment = load(Experiment, path)
-    if experiment.codec.weights is not None and any((path.parent / RUN_CODEC).glob("*")):  # a run may have moved without them
+    if experiment.codec.weights is not None and any((path.parent / RUN_CODEC).glob("*")):  # the weights may have moved
         experiment = replace(experiment, codec=replace(experiment.codec, weights=path.parent / RUN_CODEC))
     demand_admitted(experiment, str(path))
     check_experiment(experiment, str(path))
@@ -167,10 +162,10 @@ def load_recorded(path: Path) -> Experiment:
 
 
 def parse_experiment(flags: type[F], arguments: Sequence[str] | None, prog: str, description: str) -> tuple[F, Experiment]:
-    """Parse a command on a config, with its own flags and overrides of the config, which is checked.
+    """Parse a command line of a config, the command's flags and overrides of the config, and check the config.
 
     Raises:
-        ConfigError: no config is named, or a choice does not exist or does not fit.
+        ConfigError: no config is named, or a setting does not exist or does not fit.
         SystemExit: an option is unknown or malformed (code 2), or asks for --help (code 0).
     """
     command = parse_command(

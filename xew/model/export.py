@@ -1,7 +1,7 @@
-"""A trained run's network for other projects: its weights under the names of diffusers or of Wan's own code.
+"""Export of a run's network for other projects, under the weight names of diffusers or of Wan's code.
 
-Reads  a run's checkpoint (the moving average where one was kept, corrections of an adaptation added)
-Writes a folder of safetensors with config.json, as `WanTransformer3DModel.from_pretrained` opens it; or one .safetensors
+Reads  a run's checkpoint (the moving average if there is one, with LoRA corrections added)
+Writes a folder of safetensors with config.json for `WanTransformer3DModel.from_pretrained`, or one .safetensors
 Command: python -m xew.model.export RUN --out FOLDER [--naming official] [--dtype bfloat16]
 """
 
@@ -27,10 +27,10 @@ from xew.model.weights.layout import checkpoint_shapes
 
 
 def export(run: Path, out: Path, naming: Naming = "diffusers", dtype: str = "float32", step: int | None = None) -> int:
-    """Write the network of a run, and return the step of the checkpoint that it is of.
+    """Write the network of a run, and return the step of its checkpoint.
 
     Raises:
-        ConfigError: there is no such run or checkpoint, or the place is taken or cannot be written.
+        ConfigError: there is no such run or checkpoint, or `out` exists or cannot be written.
     """
     experiment = load_run_config(run)
     if out.exists() and (out.is_file() or any(out.iterdir())):
@@ -44,28 +44,28 @@ def export(run: Path, out: Path, naming: Naming = "diffusers", dtype: str = "flo
     print(f"{out}: {total:,} parameters of step {step} under the names of {naming}, {dtype}{extra}")
     base = experiment.size.rotary_base
     if base != WAVELENGTH_BASE:
-        print(f"its positions turn with base {base:g}; code with Wan's {WAVELENGTH_BASE:g} does not compute the same")
-    if (predicted := experiment.model.prediction) != "velocity":
-        print(f"its output ({predicted}) is not the velocity; code that takes it as the velocity does not sample with it")
+        print(f"its rotary positions have base {base:g}; code with Wan's base {WAVELENGTH_BASE:g} gives other results")
+    if (prediction := experiment.model.prediction) != "velocity":
+        print(f"its output is the {prediction}, not the velocity; samplers of the velocity cannot use it directly")
     return step
 
 
 @dataclass(frozen=True)
 class Args:
-    """Which run to export, and how."""
+    """Options of the export."""
 
     run: Annotated[Path, tyro.conf.Positional]
     """Folder of a trained run."""
     out: Path
     """Folder, or a file that ends in .safetensors."""
     naming: Naming = "diffusers"
-    """Names of the weights: diffusers' or those of Wan's own code."""
+    """Names of the weights: diffusers' or Wan's."""
     dtype: Literal["float32", "bfloat16"] = "float32"
     """Type of the weights."""
     checkpoint: int | None = None
-    """Step of the checkpoint; the latest where left out."""
+    """Step of the checkpoint (default: the latest)."""
     trust: tuple[str, ...] = ()
-    """Modules of your own, such as my_lab.models, that the run may name."""
+    """Custom modules, such as my_lab.models, that the run may name."""
 
 
 @user_errors

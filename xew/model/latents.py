@@ -1,10 +1,10 @@
-"""The latent cache: every stream of every training episode goes through the codec once, and no video is read in training.
+"""The latent cache: encode every stream of every training episode once, so training reads no video.
 
 Reads  episodes
 Writes <cache>/<task>/<seed>/<robot>/<stream>-KEY.safetensors float16 [clips ...], <cache>/header.json,
        <cache>/text/ if a text encoder is used
 
-KEY names the codec, the source data and the cut into clips, so that what is stale is not found and never mistaken.
+KEY is a hash of codec, source data and clips, so stale files are never read.
 Command: python -m xew.model.latents CONFIG [--data … and other overrides]
 """
 
@@ -33,9 +33,9 @@ from xew.model.video.pixels import PixelSource, rendered_pixels, stored_pixels
 from xew.protocol import validation_split
 
 CEILING_CLIPS = 8
-"""Number of clips that the codec's reconstruction is measured on."""
+"""Number of clips on which the codec ceiling is measured."""
 MOST_NAMED = 8
-"""Largest number of robots that are named one by one."""
+"""Largest number of robots that are listed by name."""
 
 
 @dataclass(frozen=True)
@@ -43,18 +43,18 @@ class Flags:
     """Options of the command itself."""
 
     from_states: bool = False
-    """Render the episodes anew; no video needs to be there."""
+    """Render the episodes from their states instead of reading their videos, in one process."""
     batch: int = 4
     """Number of clips that the codec encodes at once."""
     processes: int = 0
-    """Number of processes; 0 asks for one on a CPU and, on a GPU, one for eight cores. With --from-states there is one."""
+    """Number of processes; 0 selects one on a CPU and one for every eight cores on a GPU."""
     trust: tuple[str, ...] = ()
-    """Modules of your own tasks and robots, such as my_lab.tasks, that the data may name."""
+    """Modules of custom tasks and robots, such as my_lab.tasks, that the data may name."""
 
 
 @user_errors
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Encode what the training of an experiment reads."""
+    """Encode the training data of an experiment."""
     flags, experiment = parse_experiment(Flags, arguments, "python -m xew.model.latents", __doc__.splitlines()[0])
     if flags.batch < 1 or flags.processes < 0:
         raise ConfigError(f"--batch is {flags.batch}, --processes {flags.processes}; expected 1 or more, and 0 or more.")
@@ -67,9 +67,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def encode_experiment(experiment: Experiment, source: PixelSource = stored_pixels, batch: int = 4, processes: int = 1) -> None:
-    """Encode all that the training of an experiment reads, as `encode_episodes`, and print what was made.
+    """Encode the training data of an experiment as `encode_episodes`, and print a summary.
 
-    Several processes need a source that can be pickled.
+    Several processes need a picklable source.
     """
     check_lpips()
     encoding, choice, dataset = experiment.encoding, experiment.choice, read_dataset(experiment.data)
@@ -79,18 +79,17 @@ def encode_experiment(experiment: Experiment, source: PixelSource = stored_pixel
         keep_scales(encoding, episodes)
         experiment.instructions.encode(record.instruction for _, record in dataset.accepted)
     cache = LatentCache(encoding, codec)
-    # Experiments of a study share a cache and encode at once: those of other conditions go on, those of the same ones wait.
+    # Experiments of a study share a cache: those with the same conditions wait for each other, the others run in parallel.
     encoded = ("rgb", *sorted(condition.name for condition in encoding.inputs.conditions.values()))
     with hold_lock(encoding.folder.with_name("-".join((encoding.folder.name, *encoded))), wait=True):
         measure = partial(report_ceiling, experiment, cache, dataset, episodes, source)
-        with ThreadPoolExecutor(1) as beside:
-            # While others encode this process only waits; compiling what the ceiling takes is half a minute on a GPU.
-            measured = beside.submit(measure) if processes > 1 else None
+        with ThreadPoolExecutor(1) as thread:
+            # This process only waits while others encode, so it measures the ceiling meanwhile.
+            measured = thread.submit(measure) if processes > 1 else None
             written = encode_episodes(cache, [*episodes, *replay_episodes(dataset, choice)], source, batch, processes)
             ceiling = measured.result() if measured else measure()
         header = {"version": CACHE_VERSION, "codec": codec.hash, "clip": asdict(experiment.clip)}
-        header |= {"streams": list(cache.streams), "episodes": len(episodes)}
-        header |= {"ceiling": ceiling}
+        header |= {"streams": list(cache.streams), "episodes": len(episodes), "ceiling": ceiling}
         write_text(encoding.folder / "header.json", json.dumps(header, indent=1) + "\n")
     robots, streams = sorted({record.robot for _, record in episodes}), ", ".join(cache.streams)
     named = ", ".join(robots) if len(robots) <= MOST_NAMED else f"{len(robots)} robots"
@@ -101,18 +100,18 @@ def encode_experiment(experiment: Experiment, source: PixelSource = stored_pixel
 def report_ceiling(
     experiment: Experiment, cache: LatentCache, dataset: Dataset, episodes: Sequence[Episode], source: PixelSource
 ) -> dict[str, Any]:
-    """The codec's reconstruction on validation seeds, or on training data where there are none; never on test seeds.
+    """The codec ceiling on validation seeds, or on training episodes if there are none.
 
-    It is measured once for a cache, however many experiments are encoded into it: the header says of which videos it is.
+    It is measured once for a cache; its header lists the videos.
     """
     robots = validation_split(experiment.robots)
     validation = dataset.select(robots=(*robots.train_robots, *robots.held_out_robots), split="validation")
     chosen = choose_evenly(validation or episodes, CEILING_CLIPS)
     on = "validation seeds" if validation else "training episodes, for there are no validation seeds"
     hashes = [record.hashes["rgb"] for _, record in chosen]
-    kept = _read_ceiling(cache, experiment.clip, hashes)
-    if kept is not None:
-        return kept
+    stored = _read_ceiling(cache, experiment.clip, hashes)
+    if stored is not None:
+        return stored
     videos = (source(folder, record, ("rgb",))["rgb"] for folder, record in chosen)
     measured = measure_ceiling(cache.codec, videos, **asdict(experiment.clip))
     tqdm.write(f"codec ceiling: {measured}, of {on}")
@@ -120,7 +119,7 @@ def report_ceiling(
 
 
 def _read_ceiling(cache: LatentCache, clip: Clip, videos: Sequence[str]) -> dict[str, Any] | None:
-    """The ceiling that a cache's header has of the same codec, clips and videos (their hashes); None where it has none."""
+    """The ceiling in a cache's header for the same codec, clips and videos (their hashes), or None."""
     try:
         header = read_json(cache.encoding.folder / "header.json")
         same = (header["codec"], header["clip"]) == (cache.codec.hash, asdict(clip))

@@ -1,12 +1,11 @@
-"""Models from outside: anybody's video model predicts the study's episodes, and its rollouts are graded like ours.
+"""Custom models: predict the study's episodes with any video model, to grade its rollouts.
 
-Reads  episodes: of each what a model may know (`EpisodeInputs`)
-Writes <out>/<task>/<seed>/<robot>/rgb.mkv (lossless, the model's own size) and rollout.json
+Reads  episodes, as `EpisodeInputs`
+Writes <out>/<task>/<seed>/<robot>/rgb.mkv (lossless, the model's size) and rollout.json
 
-A model is anything that can be called with an `EpisodeInputs` and returns its video; it is named by `module:NAME`. Where NAME
-is a class it is made once, without arguments: there weights are loaded. Models that cannot run in this environment need none
-of this: `python -m xew.metrics.evaluate` grades any folder tree of their videos (`xew.rollout`).
-Rollouts that are there are not made again: where the model has changed, delete them or give another --out.
+A model `module:NAME` is a function of an `EpisodeInputs` that returns the video, or a class that is instantiated without
+arguments and then called. For models that cannot run in this environment, `python -m xew.metrics.evaluate` grades any folder
+tree of their videos (`xew.rollout`). Existing rollouts are kept: if the model has changed, delete them or give another --out.
 Command: python -m xew.model.outside module:NAME --data DATA --split test --out rollouts/NAME
 """
 
@@ -33,10 +32,9 @@ from xew.protocol import LEFT_GRIPPER, RIGHT_GRIPPER
 
 @dataclass(frozen=True)
 class EpisodeInputs:
-    """What a model may know of an episode: its first frame, the instruction, the commands and the camera; nothing measured.
+    """Input of a custom model: first frame, instruction, commands and camera, but no measurement.
 
-    It holds arrays of its own, numbers and words, and no path. Nothing in it leads to the true video or the recorded states.
-    What a system is conditioned on (relative poses, deltas, trajectory maps, ray maps) follows from these.
+    It holds copies, so nothing in it leads to the true video or the recorded states.
     """
 
     task: str
@@ -46,7 +44,7 @@ class EpisodeInputs:
     frame_rate: float
     """Number of frames a second."""
     frame_count: int
-    """Frames to predict, the given first one included."""
+    """Number of frames to predict, including the first."""
     first_frame: np.ndarray
     """Picture of the head camera, uint8 [240 320 3]."""
     joints: np.ndarray
@@ -60,7 +58,7 @@ class EpisodeInputs:
     robot_render: np.ndarray
     """Robot alone on white, posed by the commands: uint8 [t 240 320 3]."""
     streams: tuple[np.ndarray, np.ndarray] | None = None
-    """Mask and optical flow of that robot, where the model asks for them (`OutsideModel`)."""
+    """Mask and optical flow of that robot, for models with `needs_streams` (`OutsideModel`)."""
 
     @property
     def grippers(self) -> np.ndarray:
@@ -69,32 +67,31 @@ class EpisodeInputs:
 
     @property
     def robot_mask(self) -> np.ndarray:
-        """bool [t 240 320], where that robot is. Raises ConfigError where the model does not ask for it."""
+        """Mask of that robot, bool [t 240 320]. Raises ConfigError unless the model has `needs_streams`."""
         return self._stream(0)
 
     @property
     def optical_flow(self) -> np.ndarray:
-        """float32 [t 240 320 2], that robot's exact motion to the next frame [pixels]. Raises ConfigError as `robot_mask`."""
+        """That robot's exact motion to the next frame [pixels], float32 [t 240 320 2]. Raises ConfigError as `robot_mask`."""
         return self._stream(1)
 
     def _stream(self, number: int) -> np.ndarray:
         if self.streams is None:
             raise ConfigError(
-                "the mask and the optical flow are rendered for models that ask for them alone, since that takes time; give "
-                "the model the attribute `needs_streams = True`."
+                "the mask and the optical flow are not rendered for this model; give it the attribute `needs_streams = True`."
             )
         return self.streams[number]
 
 
 class OutsideModel(Protocol):
-    """An outside model. One with the attribute `needs_streams = True` is also given mask and flow."""
+    """A custom model. With the attribute `needs_streams = True` its inputs include mask and flow."""
 
     def __call__(self, inputs: EpisodeInputs) -> np.ndarray:
-        """uint8 [t h w 3] with t = inputs.frame_count, frame 0 the given one as the model sees it; any h and w of 4:3."""
+        """Video uint8 [t h w 3] with t = inputs.frame_count, including the first frame; any h and w of 4:3."""
 
 
 def load_model(name: str) -> OutsideModel:
-    """The model `module:NAME`, made where it is a class. Raises ConfigError if there is none."""
+    """The model `module:NAME`; a class is instantiated. Raises ConfigError if there is none."""
     module, _, attribute = name.partition(":")
     try:
         imported = getattr(importlib.import_module(module), attribute)
@@ -109,11 +106,11 @@ def load_model(name: str) -> OutsideModel:
 
 
 def read_inputs(episode: Episode, max_frames: int = 0, streams: bool = False) -> EpisodeInputs:
-    """What a model may know of an episode, or of its first `max_frames` frames; with `streams`, which need Warp."""
+    """Inputs of an episode or of its first `max_frames` frames; `streams` need Warp."""
     folder, record = episode
     frames = min(record.frame_count, max_frames) if max_frames else record.frame_count
     command = episode_command(folder, record)
-    # Each is copied: an array that is a view leads to all that it is a view of, as the first frame to the true video.
+    # Arrays are copied, because a view leads to its base, as the first frame to the true video.
     return EpisodeInputs(
         record.task,
         record.seed,
@@ -132,41 +129,41 @@ def read_inputs(episode: Episode, max_frames: int = 0, streams: bool = False) ->
 
 
 def predict(model: OutsideModel, name: str, inputs: EpisodeInputs) -> np.ndarray:
-    """The model's video of an episode, [t h w 3] uint8. Raises ConfigError if it is none or of another length."""
+    """The model's video of an episode, [t h w 3] uint8. Raises ConfigError if it has another type or length."""
     video = np.asarray(model(inputs))
     if video.dtype != np.uint8 or video.ndim != 4 or video.shape[-1] != 3 or len(video) != inputs.frame_count:
         raise ConfigError(
             f"{name} gave {video.dtype} {list(video.shape)} for {inputs.task}/{inputs.seed}/{inputs.robot}; "
-            f"expected uint8 [{inputs.frame_count} h w 3] (frame_count frames, the given first one included)."
+            f"expected uint8 [{inputs.frame_count} h w 3] (frame_count frames, including the first)."
         )
     return video
 
 
 @dataclass(frozen=True)
 class Args:
-    """What to predict, with what, and where it goes."""
+    """Options of a custom model's rollouts."""
 
     model: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="module:NAME")]
     """A function or class, such as examples.own_model:freeze."""
     data: Path
     """Episodes."""
     split: Literal["test", "validation", "train"] = "test"
-    """Seed family. Whatever is tuned is tuned on validation seeds."""
+    """Seed family; use validation seeds for tuning."""
     robots: tuple[str, ...] = ()
-    """Robots to predict; all of the data where left out."""
+    """Robots to predict (default: all in the data)."""
     max_frames: int = 0
-    """Predict only the first so many frames; 0 predicts all."""
+    """Number of frames to predict of each episode; 0 predicts all."""
     condition: str = ""
-    """Name of what the model is conditioned on, for the tables."""
+    """Name of the model's conditions, for the tables."""
     out: Path | None = None
-    """Folder to write to; rollouts/NAME where left out."""
+    """Folder to write to (default: rollouts/NAME)."""
     trust: tuple[str, ...] = ()
-    """Modules of your own tasks and robots, such as my_lab.tasks, that the data may name."""
+    """Modules of custom tasks and robots, such as my_lab.tasks, that the data may name."""
 
 
 @user_errors
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Predict episodes with a model from outside, and write them."""
+    """Predict episodes with a custom model, and write them."""
     args = tyro.cli(Args, args=arguments, prog="python -m xew.model.outside", description=__doc__.splitlines()[0])
     admit(args.trust)
     if args.max_frames < 0:

@@ -1,8 +1,7 @@
-"""A trained run made ready to be handed on: the network alone, in bfloat16, with a model card.
+"""Prepare a run for release: the network alone, in bfloat16, with a model card.
 
-Reads  a run, the episodes that it was trained on and, for the card, a summary of its scores
-Writes a run's folder with config, codec, scales and one checkpoint, without what only training needs; README.md, the card.
-       `rollout`, `export` and `adapt.start_from` take it as any run
+Reads  a run, its training episodes and, for the card, a summary of its scores
+Writes a run folder with config, codec, scales, one checkpoint for inference, and the model card README.md
 Command: python -m xew.model.release RUN --out FOLDER [--scores scores.summary.md]
 """
 
@@ -34,24 +33,24 @@ CARD = "README.md"
 
 
 def release(run: Path, out: Path, data: Path | None = None, scores: Path | None = None, step: int | None = None) -> int:
-    """Write the network of a run in bfloat16 as a new run, with its card, and return the step that it is of.
+    """Write the network of a run in bfloat16 as a new run with a model card, and return its step; arguments as of `Args`.
 
-    Arguments are as of the command (`Args`). Corrections of an adaptation are added to its network.
+    LoRA corrections are added to the network.
 
     Raises:
-        ConfigError: there is no such run, checkpoint or summary, or the place is taken.
+        ConfigError: there is no such run, checkpoint or summary, or `out` is in use.
         EpisodeError: the data has no training episodes.
     """
     experiment, codec = load_run(run)
     if experiment.out.resolve() != run.resolve():
         experiment = replace(experiment, out=run)
     if scores and not scores.is_file():
-        raise ConfigError(f"{scores} is no file; expected scores.summary.md of `python -m xew.metrics.evaluate`: --scores.")
+        raise ConfigError(f"--scores {scores} is not a file; expected scores.summary.md of `python -m xew.metrics.evaluate`.")
     episodes = training_episodes(read_dataset(data or experiment.data), experiment.choice)
     data_counts = count_by_task(record for _, record in episodes)
     summary = read_text(scores) if scores else ""
     params, step = load_params(run, experiment.network, step)
-    weights = Path(RUN_CODEC) if experiment.codec.weights else None  # those in the folder, wherever that lies
+    weights = Path(RUN_CODEC) if experiment.codec.weights else None
     released = replace(
         experiment,
         out=out,
@@ -69,7 +68,7 @@ def release(run: Path, out: Path, data: Path | None = None, scores: Path | None 
 
 
 def count_by_task(records: Iterable[Record]) -> dict[str, tuple[int, int]]:
-    """Numbers of distinct seeds and of episodes of each task, in order of tasks."""
+    """Numbers of seeds and of episodes of each task, sorted by task."""
     seeds: dict[str, list[int]] = defaultdict(list)
     for record in records:
         seeds[record.task].append(record.seed)
@@ -77,9 +76,10 @@ def count_by_task(records: Iterable[Record]) -> dict[str, tuple[int, int]]:
 
 
 def write_card(experiment: Experiment, step: int, size: int, seen: dict[str, tuple[int, int]], summary: str) -> str:
-    """The model card in Markdown: what the model of so many parameters is, what it was trained on, and how good it is.
+    """The model card in Markdown.
 
-    `seen` are numbers of seeds and episodes by task; `summary` is the table of scores, '' where there is none.
+    `size` is the number of parameters, `seen` are the numbers of seeds and episodes by task, and `summary` is the table of
+    scores or ''.
     """
     loader = PackageLoader("xew.model", "templates")
     template = Environment(loader=loader, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
@@ -90,20 +90,20 @@ def write_card(experiment: Experiment, step: int, size: int, seen: dict[str, tup
 
 @dataclass(frozen=True)
 class Args:
-    """Which run to release, and where to."""
+    """Options of a release."""
 
     run: Annotated[Path, tyro.conf.Positional]
     """Folder of a trained run."""
     out: Path
-    """Folder to write; it must be empty or not there."""
+    """Folder to write; it must be empty or not exist."""
     data: Path | None = None
-    """Episodes that it was trained on, for the card; those of the run's config where left out."""
+    """Training data, for the card (default: the run's)."""
     scores: Path | None = None
-    """Summary of its scores, as scores.summary.md of `python -m xew.metrics.evaluate`."""
+    """Summary of the scores, as scores.summary.md of `python -m xew.metrics.evaluate`."""
     checkpoint: int | None = None
-    """Step of the checkpoint; the latest where left out."""
+    """Step of the checkpoint (default: the latest)."""
     trust: tuple[str, ...] = ()
-    """Modules of your own, such as my_lab.models, that the run may name."""
+    """Custom modules, such as my_lab.models, that the run may name."""
 
 
 @user_errors

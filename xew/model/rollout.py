@@ -1,16 +1,16 @@
-"""Rollouts: a trained model predicts episodes from their first frame and their commands.
+"""Rollouts: predict episodes with a trained model from their first frame and their commands.
 
 Reads  a run, or a config that names published weights; episodes
 Writes <out>/<task>/<seed>/<robot>/rgb.mkv (lossless, 320x240) and rollout.json
 
-Episodes are predicted in batches over all devices; while these work on one, the next is read and the last is written.
+Episodes are predicted in batches over all devices, in parallel with reading the next batch and writing the previous one.
 Command: python -m xew.model.rollout RUN --data DATA --split test [--robots … --out … --rollout.steps …]
 """
 
 import itertools
 import sys
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -48,18 +48,20 @@ from xew.model.video.frames import to_camera_size
 from xew.rollout import write_rollout
 
 Item = tuple[Episode, dict[str, Any]]
-"""An episode to predict and the header that its rollout will have."""
+"""An episode to predict and the header of its rollout."""
 WRITERS = min(8, usable_cores())
-"""Threads that compress videos."""
+"""Number of threads that compress videos."""
 WAITING = 16
-"""Videos that may wait for a writer before predicting waits too."""
+"""Largest number of videos that wait for a writer."""
 
 
 def load_predictor(run: Path, experiment: Experiment, step: int | None = None) -> tuple[Predictor, int | None]:
-    """Load a model, with a copy of it on each device, and the step of its checkpoint.
+    """Load a run's model on each device, with the step of its checkpoint, or a config's published weights with step None.
 
-    Of a config the `model.weights` are taken as they are, and the step is None. The experiment is the config of the run, with
-    the sampling settings that were changed.
+    Args:
+        run: folder of the run, or the config.
+        experiment: its config, perhaps with other sampling settings.
+        step: of the checkpoint, by default the latest.
 
     Raises:
         ConfigError: there is no such checkpoint, or there are no such weights.
@@ -73,30 +75,30 @@ def load_predictor(run: Path, experiment: Experiment, step: int | None = None) -
 
 
 def _place_predictor(experiment: Experiment, codec: Codec, params: Any, mesh: Mesh, scales: Mapping[str, Scale]) -> Predictor:
-    """The model with its parameters in the types of its products, and a copy of the codec on each device."""
+    """The predictor with parameters in the types of their products, and a copy of the codec on each device."""
     params = jax.jit(cast_params, static_argnums=0)(network_graph(experiment.network.for_sampling), params)
     return make_predictor(experiment, jax.device_put(codec, replicated_sharding(mesh)), params, scales)
 
 
 def is_config(run: Path) -> bool:
-    """Whether it is a config with published weights, and not the folder of a run."""
+    """Whether a path is a config with published weights, not the folder of a run."""
     return run.suffix in (".yaml", ".yml") or is_packaged(run)
 
 
 def default_name(run: Path) -> str:
-    """Name of a run's rollouts where the command line gives none."""
+    """Default name of a run's rollouts."""
     run = find_config(run).resolve()
     return run.stem if is_config(run) else run.name
 
 
 def load_published(experiment: Experiment, source: Path) -> Predictor:
-    """A config's network with its published weights, untrained here.
+    """A config's network with its published weights.
 
     Raises:
-        ConfigError: the config names no weights, or needs numbers that only training determines.
+        ConfigError: the config names no weights, or needs scales of training episodes.
     """
     if experiment.model.weights is None:
-        raise ConfigError(f"{source} names no model.weights; give published ones, or the folder of a run instead of a config.")
+        raise ConfigError(f"{source} names no model.weights; set it to published weights, or give the folder of a run.")
     scaled = [condition.name for condition in experiment.conditions.values() if condition.scale != "none"]
     if scaled:
         raise ConfigError(f"{source}: {', '.join(scaled)} is scaled by training episodes; train a run and roll that out.")
@@ -107,17 +109,15 @@ def load_published(experiment: Experiment, source: Path) -> Predictor:
 
 
 def check_out(out: Path, data: Path) -> None:
-    """Raise ConfigError where rollouts would take the place of the episodes that they predict."""
+    """Raise ConfigError if rollouts would overwrite the episodes."""
     if out.resolve() == data.resolve():
-        raise ConfigError(f"--out is {out}, where the episodes are; rollouts would replace them, choose another folder.")
+        raise ConfigError(f"--out is {out}, the folder of the episodes; choose another --out.")
 
 
 def rollout_header(experiment: Experiment, step: int | None, saved: int | None, episode: Episode) -> dict[str, Any]:
-    """rollout.json: what was predicted, from what, with what. How many were predicted at once is no part of it.
+    """Content of rollout.json, independent of the batch size.
 
-    Args:
-        step, saved: of the checkpoint and when it was saved (`checkpoint_time`), which distinguishes it from the checkpoint of
-            another run of the same config; None for published weights.
+    `step` and `saved` (`checkpoint_time`) identify the checkpoint; they are None for published weights.
     """
     _, record = episode
     action, embodiment = experiment.model.action, experiment.model.embodiment
@@ -132,13 +132,13 @@ def rollout_header(experiment: Experiment, step: int | None, saved: int | None, 
 
 
 def common_header(model: str, condition: str, record: Record, max_frames: int = 0) -> dict[str, Any]:
-    """What every model's rollout.json says."""
+    """The fields that every model's rollout.json has."""
     frames = min(record.frame_count, max_frames) if max_frames else record.frame_count
     return {"model": model, "condition": condition, "source_hash": record.hashes["rgb"], "frame_count": frames}
 
 
 def is_done(out: Path, episode: Episode, header: dict[str, Any]) -> bool:
-    """Whether this very rollout is there already."""
+    """Whether a rollout with this header exists already."""
     _, record = episode
     folder = episode_folder(out, record.task, record.seed, record.robot)
     try:
@@ -147,20 +147,13 @@ def is_done(out: Path, episode: Episode, header: dict[str, Any]) -> bool:
         return False
 
 
-def group_by_length(pending: Sequence[Item], size: int) -> Iterator[list[Item]]:
-    """Groups of episodes of similar length, so that few chunks are computed for nothing."""
-    ordered = sorted(pending, key=lambda item: item[1]["frame_count"])
-    for start in range(0, len(ordered), size):
-        yield ordered[start : start + size]
-
-
 class RolloutWriter:
-    """Writes rollouts in threads; the block's end waits for all of them. A failed write is raised at the next chance.
+    """Writes rollouts in threads; the end of its `with` block waits for all. A failed write is raised by a later call.
 
     Args:
         out: root of the rollout tree.
-        done: called, in the caller's thread, after each rollout that is on disk.
-        resize: what brings a video to the size in which it is written, if anything.
+        done: called in the caller's thread after each written rollout.
+        resize: function applied to each video before writing, or None.
     """
 
     def __init__(
@@ -171,7 +164,7 @@ class RolloutWriter:
         self.waiting: deque[Future[Path]] = deque()
 
     def write(self, record: Record, video: np.ndarray, header: dict[str, Any]) -> None:
-        """Hand over uint8 [t h w 3]."""
+        """Queue a video uint8 [t h w 3]."""
         self.waiting.append(self.threads.submit(self._write, record, video, header))
         while len(self.waiting) > WAITING or (self.waiting and self.waiting[0].done()):
             self._settle()
@@ -188,36 +181,30 @@ class RolloutWriter:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        """What was handed over is written also where the block ended in an error."""
+        """Write all queued videos, also after an error in the block."""
         self.threads.shutdown(wait=True)
         while kind is None and self.waiting:
             self._settle()
 
 
-@dataclass(frozen=True)
-class _PendingBatch:
-    """A batch on the devices."""
+def predict_and_write(predictor: Predictor, pending: Sequence[Item], writer: RolloutWriter) -> None:
+    """Roll out episodes in batches of similar length, and write them; reads one batch ahead of the devices."""
+    size = max(min(predictor.settings.batch, len(pending)), 1)
+    ordered = sorted(pending, key=lambda item: item[1]["frame_count"])
+    started: deque[tuple[list[Item], Prediction]] = deque()
 
-    items: list[Item]
-    prediction: Prediction
-
-    def hand_over(self, writer: RolloutWriter) -> None:
-        for ((_, record), header), video in zip(self.items, self.prediction.fetch(), strict=True):
+    def write_oldest() -> None:
+        items, prediction = started.popleft()
+        for ((_, record), header), video in zip(items, prediction.fetch(), strict=True):
             writer.write(record, video[: header["frame_count"]], header)
 
-
-def predict_and_write(predictor: Predictor, pending: Sequence[Item], writer: RolloutWriter) -> None:
-    """Roll out episodes and write each as long as its header says; reads one batch ahead of the devices."""
-    size = max(min(predictor.settings.batch, len(pending)), 1)
-    pending_batch: _PendingBatch | None = None
-    for items in group_by_length(pending, size):
-        longest = max(header["frame_count"] for _, header in items)
-        following = _PendingBatch(items, predictor.begin([episode for episode, _ in items], longest, size))
-        if pending_batch is not None:
-            pending_batch.hand_over(writer)
-        pending_batch = following
-    if pending_batch is not None:
-        pending_batch.hand_over(writer)
+    for start in range(0, len(ordered), size):
+        items = ordered[start : start + size]
+        started.append((items, predictor.begin([episode for episode, _ in items], items[-1][1]["frame_count"], size)))
+        if len(started) > 1:
+            write_oldest()
+    while started:
+        write_oldest()
 
 
 @dataclass(frozen=True)
@@ -225,22 +212,22 @@ class Flags:
     """Options of the command itself."""
 
     checkpoint: int | None = None
-    """Step of the run's checkpoint; the latest where left out."""
+    """Step of the run's checkpoint (default: the latest)."""
     data: Path | None = None
-    """Episodes; those of the run's config where left out."""
+    """Data set (default: the run's)."""
     split: Literal["test", "validation", "train"] = "test"
-    """Seed family. Whatever is tuned is tuned on validation seeds."""
+    """Seed family; use validation seeds for tuning."""
     robots: tuple[str, ...] = ()
-    """Robots to predict; all of the data where left out."""
+    """Robots to predict (default: all in the data)."""
     out: Path | None = None
-    """Folder to write to; rollouts/<name of the run> where left out."""
+    """Folder to write to (default: rollouts/<name of the run>)."""
     trust: tuple[str, ...] = ()
-    """Modules of your own, such as my_lab.tasks, that the run and the data may name."""
+    """Custom modules, such as my_lab.tasks, that the run and the data may name."""
 
 
 @dataclass(frozen=True)
 class RunChoices:
-    """Settings of a trained run that its rollouts can change."""
+    """Settings of a run that rollouts can change."""
 
     rollout: RolloutSettings = field(default_factory=RolloutSettings)
 
@@ -270,25 +257,25 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _find_trusted(words: Sequence[str]) -> list[str]:
-    """Modules behind --trust among a command's arguments; an invalid name is an error later, when the options are parsed."""
+    """Modules after --trust in a command's arguments; parsing the options later rejects invalid names."""
     first = words.index("--trust") + 1 if "--trust" in words else len(words)
-    given = itertools.takewhile(lambda word: not word.startswith("-"), words[first:])
-    return [word for word in given if word.replace(".", "_").isidentifier() and ".." not in word]
+    names = itertools.takewhile(lambda word: not word.startswith("-"), words[first:])
+    return [name for name in names if name.replace(".", "_").isidentifier() and ".." not in name]
 
 
 def parse_rollout(arguments: Sequence[str] | None) -> tuple[Path, Flags, Experiment]:
     """Parse the command line: the run or config, the command's flags, and the experiment with its overrides.
 
-    A run takes only --rollout.… overrides; a config with published weights takes all that are not flags too.
+    A run takes only --rollout.… overrides; a config with published weights takes all overrides.
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
     path, prog, description = find_path(words, Flags), "python -m xew.model.rollout", __doc__.splitlines()[0]
     if path is not None and is_config(path):
         flags, experiment = parse_experiment(Flags, words, prog, description)
         return path, flags, experiment
-    wrong = [word for word in words if word.startswith("--") and "." in word and not word.startswith("--rollout.")]
-    if path is not None and wrong:
-        raise ConfigError(f"{' '.join(wrong)}: a trained run takes only --rollout.… overrides (see --help for the rest).")
+    refused = [word for word in words if word.startswith("--") and "." in word and not word.startswith("--rollout.")]
+    if path is not None and refused:
+        raise ConfigError(f"{' '.join(refused)}: a trained run takes only --rollout.… overrides (see --help for the rest).")
     admit(_find_trusted(words))  # the run's config is read before the options are parsed
     command = parse_command(
         Flags,

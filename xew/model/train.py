@@ -1,4 +1,4 @@
-"""Training: the latent cache to checkpoints, on any number of devices and hosts.
+"""Train a world model from the latent cache, on any number of devices and hosts.
 
 Reads  the latent cache
 Writes <out>: config, checkpoints, metrics.jsonl, TensorBoard curves and sample videos
@@ -44,7 +44,7 @@ from xew.model.training.start import begin_state
 from xew.model.training.step import StepResult, make_trainer
 
 NOISE_LEVEL_EDGES = (0.0, 0.5, 0.8, 0.95, 1.0)
-"""Bins of the noise level for each of which the mean loss is logged."""
+"""Edges of the noise-level bins of which the mean loss is logged."""
 
 
 @dataclass(frozen=True)
@@ -56,22 +56,22 @@ class Flags:
     overwrite: bool = False
     """Replace the run in --out."""
     distributed: bool = False
-    """Join the other processes that a launcher has started."""
+    """Join the other processes of a launcher."""
     ignore_memory: bool = False
-    """Start even if the estimate says that memory is too small."""
+    """Start even if the estimated memory exceeds the available memory."""
     estimate: bool = False
-    """Print the memory that training needs, and do nothing else."""
+    """Print the estimated memory and exit."""
     devices: int = 1
-    """With --estimate: number of devices."""
+    """Number of devices for --estimate."""
     memory_gb: float | None = None
-    """With --estimate: memory of each device [GB]."""
+    """Memory of each device for --estimate [GB]."""
     trust: tuple[str, ...] = ()
-    """Modules of your own tasks and robots, such as my_lab.tasks, that the data may name."""
+    """Modules of custom tasks and robots, such as my_lab.tasks, that the data may name."""
 
 
 @user_errors
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Train an experiment, or estimate the memory that this needs."""
+    """Train an experiment, or estimate its memory."""
     flags, experiment = parse_experiment(Flags, arguments, "python -m xew.model.train", __doc__.splitlines()[0])
     if flags.estimate:
         print_estimate(experiment, flags.devices, flags.memory_gb)
@@ -80,13 +80,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     start_processes(flags.distributed)
     keep_compiled_programs()
     with hold_lock(experiment.out) if jax.process_index() == 0 else contextlib.nullcontext():
-        ended = train(experiment, resume=flags.resume, overwrite=flags.overwrite, ignore_memory=flags.ignore_memory)
-    if not ended:
+        completed = train(experiment, resume=flags.resume, overwrite=flags.overwrite, ignore_memory=flags.ignore_memory)
+    if not completed:
         sys.exit(STOPPED)
 
 
 def print_estimate(experiment: Experiment, devices: int, memory_gb: float | None) -> None:
-    """Print the memory of a run on devices that need not be there, with the arithmetic."""
+    """Print the estimated memory of a run on a number of devices, which need not exist."""
     if devices < 1:
         raise ConfigError(f"--devices is {devices}; expected at least one.")
     mesh = AbstractMesh(mesh_shape(experiment.mesh, devices), AXES)
@@ -98,8 +98,8 @@ def print_estimate(experiment: Experiment, devices: int, memory_gb: float | None
 
 
 def train(experiment: Experiment, *, resume: bool = False, overwrite: bool = False, ignore_memory: bool = False) -> bool:
-    """Train an experiment to its last step, from the start or from its latest checkpoint; returns whether it came there."""
-    # Everything that can be missing or too small is an error before a run folder is made.
+    """Train an experiment, from the start or its latest checkpoint; returns whether it reached the last step."""
+    # Missing data and too little memory are errors before the run folder is created.
     mesh = make_mesh(experiment.mesh)
     check_batch(experiment.train.batch, experiment.train.accumulate, mesh.size)
     own = process_samples(mesh, experiment.train.batch)
@@ -131,7 +131,7 @@ def train(experiment: Experiment, *, resume: bool = False, overwrite: bool = Fal
 
 
 def summarize(results: Sequence[StepResult]) -> dict[str, float]:
-    """Means of the loss, of the loss by noise level and of the gradient norm over some steps."""
+    """Mean loss, loss by noise level and gradient norm over some steps."""
     losses, sigma, weights = (np.concatenate([getattr(r, name) for r in results]) for name in ("losses", "sigma", "weights"))
     norms = [float(result.gradient_norm) for result in results]
     values = {"train/loss": (weights * losses).sum(axis=1).mean(), "train/gradient_norm": np.mean(norms)}

@@ -71,7 +71,7 @@ def test_the_next_reference_is_what_a_rollout_would_encode(codec: ConvAutoencode
 
 
 def test_refuses_clips_that_do_not_fit(codec: ConvAutoencoderCodec) -> None:
-    with pytest.raises(ValueError, match="needs 4 k"):
+    with pytest.raises(ValueError, match="t = 4 k"):
         codec.encode(smooth_clip(0)[:8])
     with pytest.raises(ValueError, match="sides in 8s"):
         codec.encode(smooth_clip(0)[:, :30])
@@ -130,7 +130,7 @@ def test_autoencoder_codec(vae_codec: WanVaeCodec) -> None:
     assert latents.shape == (4, 4, 6, 48) and latents.dtype == np.float32
     decoded = vae_codec.decode(latents)
     assert decoded.shape == (13, 32, 48, 3) and decoded.dtype == np.uint8
-    with pytest.raises(ValueError, match="needs 4 k"):
+    with pytest.raises(ValueError, match="t = 4 k"):
         vae_codec.encode(video[:12])
 
 

@@ -50,7 +50,7 @@ def test_shapes_and_types(codec: ConvAutoencoderCodec) -> None:
     assert latents.shape == (4, 2, 3, 48) and latents.dtype == np.float32
     decoded = codec.decode(latents)
     assert decoded.shape == (13, 32, 48, 3) and decoded.dtype == np.uint8
-    with pytest.raises(ValueError, match="needs 4 k"):
+    with pytest.raises(ValueError, match="t = 4 k"):
         codec.encode(video[:12])
 
 
@@ -130,7 +130,7 @@ def test_missing_weights_are_told(monkeypatch: pytest.MonkeyPatch, tmp_path: Pat
     for path in (None, tmp_path / "nowhere.safetensors"):
         with pytest.raises(ConfigError, match="there are no weights at"):
             ConvAutoencoderCodec.open(CodecSettings(weights=path))
-    with pytest.raises(ConfigError, match=r"holds no \.safetensors; name one file"):
+    with pytest.raises(ConfigError, match=r"holds no \.safetensors; expected the path of one file"):
         ConvAutoencoderCodec.open(CodecSettings(weights=tmp_path))
 
 
@@ -142,10 +142,10 @@ def test_packaged_weights_are_found(monkeypatch: pytest.MonkeyPatch, weights: Pa
 def test_settings_and_files_that_do_not_fit_are_told(weights: Path, tmp_path: Path) -> None:
     tensors = load_file(weights)
     save_file(tensors, tmp_path / "nameless.safetensors")
-    with pytest.raises(ConfigError, match="does not say the size"):
+    with pytest.raises(ConfigError, match="does not hold the size"):
         load_autoencoder(tmp_path / "nameless.safetensors")
     (tmp_path / "broken.safetensors").write_bytes(weights.read_bytes()[:1000])
-    with pytest.raises(ConfigError, match="no whole safetensors file"):
+    with pytest.raises(ConfigError, match="not a whole safetensors file"):
         load_autoencoder(tmp_path / "broken.safetensors")
     with pytest.raises(ValueError, match="as many stages"):
         AutoencoderSize((8, 8), (1, 1), (8,), (1,))

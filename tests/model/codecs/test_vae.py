@@ -143,7 +143,7 @@ def test_statistics_of_a_checkpoint_lie_in_its_config(vae: VideoVae, tmp_path: P
     np.testing.assert_array_equal(loaded.latents_std[...], vae.latents_std[...])
     for wrong in ([1.0], "much", [0.0] * CHANNELS, [float("nan")] * CHANNELS):
         (tmp_path / "theirs" / "config.json").write_text(json.dumps({"latents_std": wrong}))
-        with pytest.raises(ConfigError, match=f"latents_std of config.json .* no list of {CHANNELS} finite numbers"):
+        with pytest.raises(ConfigError, match=f"latents_std of config.json .* not a list of {CHANNELS} finite numbers"):
             load_vae(loaded, tmp_path / "theirs")
 
 

@@ -194,5 +194,5 @@ def test_another_torch_file_is_refused(tmp_path: Path) -> None:
     import torch
 
     torch.save({"weight": torch.zeros(3)}, tmp_path / "other.pth")
-    with pytest.raises(ConfigError, match=r"no autoencoder of Wan2\.2: it holds weight"):
+    with pytest.raises(ConfigError, match=r"not an autoencoder of Wan2\.2: it holds weight"):
         load_vae(abstract_vae(SIZE), tmp_path / "other.pth")

@@ -142,7 +142,7 @@ def test_a_network_at_its_start_predicts_the_guess_that_it_is_given() -> None:
 
 def test_no_condition_feeds_what_the_network_has_of_itself(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(CONDITIONS, "wrong", Condition("wrong", "reference_channels", None, title="Wrong", label="wrong"))
-    with pytest.raises(ConfigError, match=r"feeds 'reference_channels'; conditions feed action, embodiment, joints, history, "):
+    with pytest.raises(ConfigError, match=r"feeds 'reference_channels'; expected one of action, embodiment, joints, history, "):
         load_experiment(ROOT / "configs/debug.yaml", ["--model.embodiment", "wrong"])
     experiment = load_experiment(ROOT / "configs/debug.yaml", ["--model.reference", "channels"])
     assert "reference_channels" in experiment.network.streams and "reference_channels" not in experiment.inputs.shapes

@@ -130,13 +130,13 @@ def test_other_weights_are_another_cache(files: Path, tmp_path: Path) -> None:
 
 
 def test_missing_files_say_what_to_do(files: Path, tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"model\.text_weights and model\.text_tokenizer not set"):
+    with pytest.raises(ConfigError, match=r"needs model\.text_weights and model\.text_tokenizer; set"):
         experiment(tmp_path, "text: umt5").instructions.encode(TEXTS)
     gone = f"text: umt5_tiny, text_weights: {tmp_path / 'none.pth'}, text_tokenizer: {files}"
     with pytest.raises(ConfigError, match=r"none\.pth"):
         experiment(tmp_path, gone).instructions.encode(TEXTS)
     (tmp_path / "tokenizer.json").write_text("{}")
-    with pytest.raises(ConfigError, match="is no tokenizer"):
+    with pytest.raises(ConfigError, match="is not a tokenizer"):
         load_tokenizer(tmp_path)
 
 

@@ -95,7 +95,7 @@ def fails(command: Callable[[list[str]], None], arguments: list[str], capsys: py
 def network(run: Path) -> tuple[Any, int]:
     """Parameters of a run, and of which step they are."""
     experiment = load_experiment(run / "config.yaml")
-    return checkpoint.restore_params(run, make_trainer(experiment.spec, make_mesh(experiment.mesh)).network_shapes)
+    return checkpoint.load_params(run, experiment.network)
 
 
 def changed(experiment: Experiment, **settings: Any) -> Experiment:
@@ -350,7 +350,8 @@ def test_step_of_the_full_size_is_made_from_shapes() -> None:
     mesh = make_mesh(experiment.mesh)
     trainer = make_trainer(experiment.spec, mesh, LastFrame())
     batch = jax.eval_shape(lambda: jax.tree.map(jnp.asarray, fake_batch(experiment.inputs, 8)))
-    state, result = trainer.lower_step(trainer.shapes, batch).out_info
+    with jax.set_mesh(mesh):
+        state, result = trainer._compiled_step.lower(trainer.shapes, batch, trainer._codec_copies).out_info
     assert result.losses.shape == (8, 2)
     assert jax.tree.map(lambda leaf: leaf.shape, state) == jax.tree.map(lambda leaf: leaf.shape, trainer.shapes)
 
@@ -369,17 +370,17 @@ def test_epochs_are_passes_over_the_new_samples(experiment: Experiment) -> None:
 @pytest.mark.parametrize(
     ("overrides", "said"),
     [
-        (["--train.steps", "0"], "give one of them"),
-        (["--train.epochs", "2"], "give one of them"),
+        (["--train.steps", "0"], "set one of them"),
+        (["--train.epochs", "2"], "set one of them"),
         (["--train.batch", "3", "--train.accumulate", "2"], "train.batch is 3; it must be a multiple of"),
         (["--mesh.fsdp", "3"], "mesh is data -1 x fsdp 3, there are 1 devices"),
-        (["--adapt.start-from", "x"], "adapt needs the robots"),
+        (["--adapt.start-from", "x"], "adapt needs adapt.robots"),
         (["--train.shift", "0"], "train.shift is 0; it must be over 0"),
         (["--train.log-every", "0"], "train.log_every is 0; it must be at least 1"),
         (["--train.batch", "0"], "train.batch is 0; it must be at least 1"),
         (["--train.ema", "0.5"], "train.ema is 0.5 of the run; it must be at most 0.25"),
-        (["--adapt.robots", "piper"], "adapt.start_from not which run to adapt"),
-        (["--adapt.start-from", "x", "--adapt.robots", "piper", "--adapt.replay", "0.9"], "a part that leaves room"),
+        (["--adapt.robots", "piper"], "adapt is set without adapt.start_from"),
+        (["--adapt.start-from", "x", "--adapt.robots", "piper", "--adapt.replay", "0.9"], "a part below 1 that leaves"),
         (["--adapt.start-from", "nowhere", "--adapt.robots", "piper"], "nowhere holds no run"),
     ],
 )
@@ -563,7 +564,7 @@ def test_run_with_corrections_resumes_and_is_read(world: Path, tmp_path: Path, c
     elsewhere = (tmp_path / "run").rename(tmp_path / "elsewhere")
     jax.tree.map(np.testing.assert_array_equal, network(elsewhere)[0], after)
     shutil.rmtree(base / "checkpoints" / "2")
-    with pytest.raises(ConfigError, match="not there any more or was trained again"):
+    with pytest.raises(ConfigError, match="no longer exists or was trained again"):
         network(elsewhere)
     (elsewhere / "start.json").unlink()
     with pytest.raises(ConfigError, match="does not say from which checkpoint"):
@@ -572,7 +573,7 @@ def test_run_with_corrections_resumes_and_is_read(world: Path, tmp_path: Path, c
 
 def test_checkpoint_of_a_step_that_is_not_there_is_told(world: Path) -> None:
     with pytest.raises(ConfigError, match=r"has no checkpoint of step 9; it has 1, 2\."):
-        checkpoint.restore_params(world / "run", network(world / "run")[0], 9)
+        checkpoint.load_params(world / "run", load_experiment(world / "config.yaml").network, 9)
 
 
 def test_fake_batches_have_a_second_chunk_only_where_asked(experiment: Experiment) -> None:

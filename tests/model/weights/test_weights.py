@@ -193,7 +193,7 @@ def test_shards_by_index_by_folder_and_without_index(arrays: Arrays, tmp_path: P
 def test_broken_indexes_are_told(arrays: Arrays, tmp_path: Path) -> None:
     index = sharded(arrays, tmp_path / "shards")
     (index.parent / "model-00002-of-00002.safetensors").rename(tmp_path / "elsewhere.safetensors")
-    assert "names shards that are not there: model-00002-of-00002.safetensors" in refusal(index)
+    assert "names missing shards: model-00002-of-00002.safetensors" in refusal(index)
     whole = json.loads(index.read_text())
     for name in ("../elsewhere.safetensors", str(tmp_path / "elsewhere.safetensors"), "..\\elsewhere.safetensors", "x.pth"):
         index.write_text(json.dumps({"weight_map": whole["weight_map"] | {"conv": name}}))
@@ -218,14 +218,14 @@ def test_folders_that_say_too_little(arrays: Arrays, tmp_path: Path) -> None:
     save_file(arrays, folder / "b.safetensors")
     assert "repeats tensors of another file" in refusal(folder)
     (tmp_path / "weights.ckpt").touch()
-    assert "is no checkpoint that is known here" in refusal(tmp_path / "weights.ckpt")
+    assert "is not a known kind of checkpoint" in refusal(tmp_path / "weights.ckpt")
 
 
 def test_a_cut_file_is_told(arrays: Arrays, tmp_path: Path) -> None:
     path = tmp_path / "in.safetensors"
     save_file(arrays, path)
     path.write_bytes(path.read_bytes()[:-10])
-    assert "is no whole safetensors file" in refusal(path)
+    assert "is not a whole safetensors file" in refusal(path)
 
 
 @pytest.mark.lab

@@ -1,6 +1,6 @@
-"""The latent cache: every stream of an episode encoded once, and the scales of conditions that are numbers.
+"""The latent cache: every stream of an episode encoded once, and the scales of numeric conditions.
 
-What is stale is never found, and what is missing is an error that says how to make it.
+File names hold a hash of their sources, so stale files are never read. A missing file is an error with the remedy.
 """
 
 __all__ = ["clips", "encode", "keys", "scales", "store"]

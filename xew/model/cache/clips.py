@@ -1,4 +1,4 @@
-"""Clips of episodes: where they start, which pixels they need, and what each stream of a clip is made from."""
+"""Clips of episodes: their first frames, the pixels that they need, and the input of each stream of a clip."""
 
 import itertools
 from collections.abc import Collection, Mapping, Sequence
@@ -17,8 +17,8 @@ from xew.model.video.pixels import Pixels, stored_pixels
 def sample_starts(frame_count: int, frames: int, chunks: int = 1) -> tuple[tuple[int, ...], ...]:
     """First frames of the chunks of every training sample of an episode.
 
-    One chunk: the chunks of a rollout that fit, and the last clip that fits. Two: every chunk of a rollout with its
-    successor, which shares one frame with it and may go past the episode's end; an episode of one chunk is one sample of it.
+    With one chunk: the chunks of a rollout that fit, and the last clip that fits. With two: every chunk of a rollout and its
+    successor, which share one frame; the successor may pass the episode's end. An episode of one chunk gives one sample.
     """
     if chunks == 1:
         last = max(frame_count - frames, 0)
@@ -28,7 +28,7 @@ def sample_starts(frame_count: int, frames: int, chunks: int = 1) -> tuple[tuple
 
 
 def clip_starts(frame_count: int, frames: int, chunks: int = 1) -> tuple[int, ...]:
-    """First frames of all clips of an episode that any training sample has."""
+    """First frames of all clips in an episode's training samples."""
     samples = sample_starts(frame_count, frames, chunks)
     return tuple(sorted({start for sample in samples for start in sample}))
 
@@ -41,9 +41,9 @@ def read_streams(
     streams: Collection[str],
     pixels: Pixels | None = None,
 ) -> dict[str, np.ndarray]:
-    """Read the named streams of a whole episode: [t h w 3] uint8 at the model's size, or [t n] float32.
+    """Read streams (rgb and keys of `conditions`) of an episode: [t h w 3] uint8 at the model's size or [t n] float32.
 
-    Streams are rgb and keys of `conditions`. Where the episode's pixels are not at hand (`needed_pixels`), its videos are read.
+    Without `pixels` the episode's videos are read.
     """
     if pixels is None:
         pixels = stored_pixels(folder, record, needed_pixels(conditions, streams))
@@ -56,7 +56,7 @@ def read_streams(
 
 
 def needed_pixels(conditions: Mapping[str, Condition], streams: Collection[str]) -> list[str]:
-    """Names of the videos of an episode that the named streams are made from whole, among rgb and robot."""
+    """Names of the episode's videos, among rgb and robot, that the named streams need in full."""
     scene = any(name == "rgb" or conditions[name].make is None for name in streams)
     robot = any(name in conditions and conditions[name].make in (robot_render, pasted_render) for name in streams)
     return [name for name, needed in (("rgb", scene), ("robot", robot)) if needed]
@@ -65,14 +65,16 @@ def needed_pixels(conditions: Mapping[str, Condition], streams: Collection[str])
 def cut_clip(
     condition: Condition | None, video: np.ndarray, start: int, frames: int, history: Sequence[int] = ()
 ) -> list[np.ndarray]:
-    """Cut what one clip of one stream is made from: clips [t h w 3] uint8 to be encoded and joined, or numbers [t' n] float32.
+    """Cut the input of one clip of one stream: clips [t h w 3] uint8 to encode and join, or numbers [t' n] float32.
 
-    Past the end the last frame is repeated. A condition that is not aligned is encoded whole. Earlier frames are encoded one
-    by one (`history`, counted from the clip's first frame); before the start the first is repeated.
+    An unaligned condition is returned whole.
 
     Args:
         condition: None for rgb.
-        video: of the whole episode, [t h w 3] uint8 or [t n] float32.
+        video: of the whole episode, [t h w 3] uint8 or [t n] float32; its first and last frame are repeated beyond its ends.
+        start: first frame of the clip.
+        frames: number of frames.
+        history: earlier frames, relative to `start`, each encoded alone.
     """
     if condition is not None and condition.make is None:
         return [video[frame : frame + 1] for frame in np.maximum(start + np.asarray(history), 0)]
@@ -83,5 +85,5 @@ def cut_clip(
 
 
 def take_frames(video: np.ndarray, start: int, frames: int) -> np.ndarray:
-    """Some frames [t h w 3] of a video [t' h w 3] from `start` on; past its end the last frame is repeated."""
+    """Frames [t h w 3] of a video [t' h w 3] from `start` on; past its end the last frame is repeated."""
     return video[np.minimum(np.arange(start, start + frames), len(video) - 1)]

@@ -1,7 +1,4 @@
-"""Encoding episodes into the latent cache: pixels are read or rendered ahead in threads, the codec works in batches.
-
-Threads of one process keep about six cores busy, for NumPy and OpenCV hold Python's lock in between; so there are processes.
-"""
+"""Encoding episodes into the latent cache: threads read or render pixels ahead, the codec encodes in batches."""
 
 import functools
 import sys
@@ -18,20 +15,19 @@ from xew.dataset import Episode
 from xew.episode import Record
 from xew.model.cache.clips import cut_clip, needed_pixels, read_streams
 from xew.model.cache.store import LatentCache
-from xew.model.codecs.contract import Codec, check_clip_shape, encode_pictures
+from xew.model.codecs.contract import Codec, encode_pictures
 from xew.model.video.pixels import PixelSource, stored_pixels
 
 ENCODERS = 3
-"""Number of episodes that an accelerator encodes side by side: one computes while others are copied to it and back. Where
-several processes share it, each has one."""
+"""Number of episodes that one process encodes at once on an accelerator, to overlap copies and computation."""
 CORES_PER_PROCESS = 8
-"""Number of cores for each process: its threads keep about six busy, and each takes gigabytes of a GPU's memory."""
+"""Number of cores for each process: its threads keep about six busy, limited by Python's lock."""
 GROUP = 16
-"""Number of episodes that a process is given at once."""
+"""Number of episodes in a process's work item."""
 
 
 def default_processes() -> int:
-    """Number of processes that fill this machine, each with a GPU of its own; a CPU's one computes with all cores already."""
+    """Number of processes that use this machine fully; one on a CPU, where it already uses all cores."""
     return 1 if jax.default_backend() == "cpu" else max(len(jax.local_devices()), usable_cores() // CORES_PER_PROCESS)
 
 
@@ -42,10 +38,9 @@ def encode_episodes(
     batch: int = 4,
     processes: int = 1,
 ) -> int:
-    """Encode what is missing of some episodes, and return the number of bytes written.
+    """Encode the missing streams of episodes, `batch` clips at once, and return the number of bytes written.
 
-    Pixels are read or rendered, and conditions drawn, ahead in threads; `batch` clips are encoded at once. Processes share the
-    work, each with threads and, on a GPU, a codec of its own; they have the GPUs in turn.
+    Several processes share the episodes, each with its own threads and codec; they are assigned to the GPUs in turn.
     """
     pending = [episode for episode in episodes if cache.missing(episode[1])]
     if processes > 1:
@@ -63,7 +58,7 @@ def encode_episodes(
 
 
 class _Encoder:
-    """Encodes episodes in the threads of one process, which take turns at the codec."""
+    """Encodes episodes in the threads of one process; a semaphore limits concurrent use of the codec."""
 
     def __init__(self, cache: LatentCache, source: PixelSource, batch: int, processes: int = 1) -> None:
         self.cache, self.source, self.batch = cache, source, batch
@@ -71,7 +66,7 @@ class _Encoder:
         self._turns = threading.BoundedSemaphore(ENCODERS if processes == 1 and jax.default_backend() != "cpu" else 1)
 
     def encode(self, episode: Episode) -> int:
-        """Encode what is missing of one episode; returns the number of bytes written."""
+        """Encode the missing streams of one episode; returns the number of bytes written."""
         missing, inputs = self.cache.missing(episode[1]), self.cache.encoding.inputs
         pixels = self.source(*episode, needed_pixels(inputs.conditions, missing))
         videos = read_streams(inputs.conditions, inputs.clip, *episode, missing, pixels)
@@ -79,7 +74,7 @@ class _Encoder:
             return _encode_streams(self.cache, episode[1], videos, self.batch)
 
     def encode_group(self, episodes: Sequence[Episode]) -> int:
-        """Encode some episodes side by side; returns the number of bytes written."""
+        """Encode episodes in parallel; returns the number of bytes written."""
         return sum(map_in_order(self.encode, episodes, self._threads))
 
 
@@ -89,8 +84,12 @@ def _open_encoder(cache: LatentCache, source: PixelSource, batch: int, processes
 
 
 def _encode_streams(cache: LatentCache, record: Record, videos: dict[str, np.ndarray], batch: int) -> int:
-    """Encode some streams of one episode, and write each as a whole."""
-    pieces = {name: _cut_stream(cache, record, name, video) for name, video in videos.items()}
+    """Encode streams of one episode and write each."""
+    inputs, pieces = cache.encoding.inputs, {}
+    for name, video in videos.items():
+        condition = cache.streams[name]
+        starts = cache.starts(record) if condition is None or condition.aligned else (0,)
+        pieces[name] = [cut_clip(condition, video, start, inputs.clip.frames, inputs.history) for start in starts]
     pictures = [piece for clips in pieces.values() for clip in clips for piece in clip if piece.dtype == np.uint8]
     encoded = iter(encode_many(cache.codec, pictures, batch))
     written = 0
@@ -100,22 +99,10 @@ def _encode_streams(cache: LatentCache, record: Record, videos: dict[str, np.nda
     return written
 
 
-def _cut_stream(cache: LatentCache, record: Record, name: str, video: np.ndarray) -> list[list[np.ndarray]]:
-    """What each clip of a stream is made from, see `cut_clip`."""
-    condition, inputs = cache.streams[name], cache.encoding.inputs
-    starts = cache.starts(record) if condition is None or condition.aligned else (0,)
-    return [cut_clip(condition, video, start, inputs.clip.frames, inputs.history) for start in starts]
-
-
 def encode_many(codec: Codec, clips: Sequence[np.ndarray], batch: int) -> list[np.ndarray]:
-    """Encode clips [t h w 3] uint8 to latents [t' h' w' c] float32, `batch` of equal shape at once.
-
-    The last batch is filled up.
-    """
+    """Encode clips [t h w 3] uint8 to latents [t' h' w' c] float32, `batch` of equal shape at once."""
     encoded: dict[int, np.ndarray] = {}
-    shapes = sorted({clip.shape for clip in clips})
-    for shape in shapes:
-        check_clip_shape(shape, codec.spatial_factor)
+    for shape in sorted({clip.shape for clip in clips}):
         same = [index for index, clip in enumerate(clips) if clip.shape == shape]
         for group in (same[first : first + batch] for first in range(0, len(same), batch)):
             filled = group + group[-1:] * (batch - len(group))

@@ -1,7 +1,4 @@
-"""Names of the files of the latent cache: each holds a key of what its content was made from.
-
-What is stale is therefore not found, and never mistaken.
-"""
+"""File names of the latent cache; each holds a hash of the sources of its content, so a stale file is never read."""
 
 import hashlib
 import json
@@ -16,7 +13,7 @@ from xew.model.settings.parts import Encoding
 
 CACHE_VERSION = 2
 RUN_SCALES = "scales.json"
-"""Name of the file in a run that holds the scales of its numbers."""
+"""Name of the file in a run with the scales of its numeric conditions."""
 
 
 def stream_path(encoding: Encoding, codec_hash: str, record: Record, stream: str) -> Path:
@@ -36,7 +33,7 @@ def stream_path(encoding: Encoding, codec_hash: str, record: Record, stream: str
 
 
 def scales_path(encoding: Encoding, episodes: Sequence[Episode]) -> Path:
-    """The file where the scales of these episodes' numbers are kept: in the cache, or in the run to adapt."""
+    """The file of the scales of these episodes' numbers: in the cache, or in the run to adapt."""
     if encoding.start_from is not None:
         return encoding.start_from / RUN_SCALES
     names = sorted({condition.name for condition in encoding.inputs.conditions.values() if condition.scale != "none"})

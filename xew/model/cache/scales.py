@@ -1,7 +1,6 @@
-"""Normalization of conditions that are numbers, by their spread over the training episodes.
+"""Normalization of numeric conditions by their spread over the training episodes.
 
-Reads  the numbers that conditions make of the training episodes' commands
-Writes `Scale`, kept with the latent cache and with the run, since a rollout needs the very same
+Scales are stored with the latent cache and with the run, because rollouts must use the scales of training.
 """
 
 import json
@@ -20,17 +19,16 @@ from xew.model.episodes.commands import episode_command
 from xew.model.settings.parts import Encoding
 
 PERCENTILES = (1, 99)
-"""Percentiles that become -1 and 1, with clipping beyond, as in Ctrl-World and Boundless-World-Model."""
+"""Percentiles that map to -1 and 1, with clipping beyond, as in Ctrl-World and Boundless-World-Model."""
 RUN_REMEDY = "train it again with --overwrite"
-"""Sentence on what to do where a run's scales are damaged or lost."""
+"""Remedy if a run's scales are damaged or lost."""
 STILL = 1e-3
-"""Least width [m, rad or 1]: a number that hardly moves over all training episodes is divided by this, so that its noise is
-not blown up."""
+"""Least width [m, rad or 1], so the noise of a nearly constant number is not amplified."""
 
 
 @dataclass(frozen=True)
 class Scale:
-    """The normalization (x - middle) / width, clipped where there is a limit."""
+    """The normalization (x - middle) / width, clipped at `limit` if there is one."""
 
     middle: np.ndarray
     """[n] float32."""
@@ -39,14 +37,14 @@ class Scale:
     limit: float | None
 
     def __call__(self, values: np.ndarray) -> np.ndarray:
-        """Normalize values [... k*n], which are k times n numbers beside each other, to float32 of their shape."""
+        """Normalize values [... k*n], k groups of n numbers, to float32 [... k*n]."""
         scaled = (values.reshape(*values.shape[:-1], -1, len(self.middle)) - self.middle) / self.width
         scaled = scaled if self.limit is None else np.clip(scaled, -self.limit, self.limit)
         return scaled.reshape(values.shape).astype(np.float32)
 
 
 def fit_scales(conditions: Iterable[Condition], commands: Iterable[Command]) -> dict[str, Scale]:
-    """Fit the scale of every condition that has one, by its name, to commands [t 16] of episodes."""
+    """Fit the scale of every condition that needs one, by name, to the commands of episodes (actions [t 16])."""
     scaled = {condition.name: condition for condition in conditions if condition.scale != "none"}
     values: dict[str, list[np.ndarray]] = {name: [] for name in scaled}
     for command in commands if scaled else ():
@@ -69,13 +67,13 @@ def _fit(condition: Condition, values: np.ndarray) -> Scale:
 def apply_scales(
     scales: Mapping[str, Scale], conditions: Mapping[str, Condition], arrays: Mapping[str, np.ndarray]
 ) -> dict[str, np.ndarray]:
-    """Normalize the arrays [... n], by stream, of those conditions that have a scale; the others stay as they are."""
+    """Normalize the arrays [... n], by stream, of conditions with a scale; other arrays are returned unchanged."""
     names = {stream: condition.name for stream, condition in conditions.items() if condition.scale != "none"}
     return {stream: scales[names[stream]](array) if stream in names else array for stream, array in arrays.items()}
 
 
 def dump_scales(scales: Mapping[str, Scale]) -> str:
-    """The JSON of scales, as `read_scales` reads it."""
+    """Serialize scales to the JSON that `read_scales` reads."""
     content = {
         name: {"middle": scale.middle.tolist(), "width": scale.width.tolist(), "limit": scale.limit}
         for name, scale in scales.items()
@@ -85,7 +83,7 @@ def dump_scales(scales: Mapping[str, Scale]) -> str:
 
 @dataclass(frozen=True)
 class _StoredScale:
-    """A `Scale` as its file has it."""
+    """A `Scale` as stored in its file."""
 
     middle: tuple[float, ...]
     width: tuple[float, ...]
@@ -99,11 +97,7 @@ class _StoredScale:
 
 
 def read_scales(path: Path, conditions: Sequence[Condition], remedy: str) -> dict[str, Scale]:
-    """The scales that the conditions need; nothing is read where none needs one.
-
-    Raises:
-        ConfigError: there is no such file, it is damaged, or lacks one; `remedy` says what to do.
-    """
+    """The scales that the conditions need. Raises ConfigError with `remedy` if the file is missing, damaged or incomplete."""
     names = {condition.name for condition in conditions if condition.scale != "none"}
     if not names:
         return {}
@@ -112,28 +106,24 @@ def read_scales(path: Path, conditions: Sequence[Condition], remedy: str) -> dic
         stored = {name: parse(_StoredScale, content[name], name) for name in sorted(names)}
         return {name: scale.as_scale() for name, scale in stored.items()}
     except (OSError, ValueError, KeyError, TypeError, ConfigError) as error:
-        found = " ".join(str(error).split())
-        raise ConfigError(f"{path} does not hold the scales of {', '.join(sorted(names))} ({found}); {remedy}.") from error
+        reason = " ".join(str(error).split())
+        raise ConfigError(f"{path} does not hold the scales of {', '.join(sorted(names))} ({reason}); {remedy}.") from error
 
 
 def load_run_scales(conditions: Mapping[str, Condition], run: Path) -> dict[str, Scale]:
-    """The scales that a run was trained with. Raises ConfigError if it needs some and has none."""
+    """The scales that a run was trained with. Raises ConfigError as `read_scales`."""
     return read_scales(run / RUN_SCALES, tuple(conditions.values()), RUN_REMEDY)
 
 
 def load_scales(encoding: Encoding, episodes: Sequence[Episode]) -> dict[str, Scale]:
-    """The scales of these episodes' numbers, or in an adaptation those of the run that it starts from.
-
-    Raises:
-        ConfigError: `latents` has not been run for them, or the run has lost them.
-    """
+    """The scales of these episodes, or of the run that an adaptation starts from. Raises ConfigError as `read_scales`."""
     conditions = tuple(encoding.inputs.conditions.values())
     remedy = encoding.remedy if encoding.start_from is None else RUN_REMEDY
     return read_scales(scales_path(encoding, episodes), conditions, remedy)
 
 
 def keep_scales(encoding: Encoding, episodes: Sequence[Episode]) -> None:
-    """Fit and keep the scales of numbers of these episodes, where any is needed and they are not there yet."""
+    """Fit and store the scales of these episodes, unless none is needed or they exist."""
     path, conditions = scales_path(encoding, episodes), encoding.inputs.conditions.values()
     if any(condition.scale != "none" for condition in conditions) and encoding.start_from is None and not path.exists():
         scales = fit_scales(conditions, (episode_command(folder, record) for folder, record in episodes))

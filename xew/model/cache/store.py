@@ -1,4 +1,4 @@
-"""The latent cache on disk: each stream of each episode in one file, written once and read clip by clip."""
+"""The latent cache on disk: one file for each stream of each episode, written once and read clip by clip."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,12 +19,12 @@ from xew.model.settings.parts import Encoding
 from xew.names import path_below
 
 CLIPS = "clips"
-"""Name of the one array of a cached stream. Safetensors and not .npy, whose headers no two threads may read at once."""
+"""Name of the array in a cached stream's file; safetensors, because NumPy cannot parse .npy headers in parallel threads."""
 
 
 @dataclass(frozen=True)
 class LatentCache:
-    """Encoded streams, and whether they are still those of their data."""
+    """Encoded streams of an experiment's episodes."""
 
     encoding: Encoding
     codec: Codec
@@ -44,9 +44,7 @@ class LatentCache:
         return clip_starts(record.frame_count, inputs.clip.frames, inputs.chunks)
 
     def read(self, record: Record, stream: str, clip: int) -> np.ndarray:
-        """Read one stream of one clip of an episode: latents [t h w c] float16 or numbers [t n] float32.
-
-        What is not aligned has one clip for all.
+        """Read one clip of a stream: latents [t h w c] float16 or numbers [t n] float32; unaligned streams have one clip.
 
         Raises:
             ConfigError: it was never encoded, or from other data, codec or clips.
@@ -58,13 +56,13 @@ class LatentCache:
                 return clips[min(clip, clips.get_shape()[0] - 1)]
         except FileNotFoundError:
             stale = list(path.parent.glob(f"{path.stem.rpartition('-')[0]}-*.safetensors"))
-            found = "was encoded from other data, with another codec or other clips" if stale else "is not in the cache"
-            raise ConfigError(f"{path.parent}: the stream {stream} {found}; {self.encoding.remedy}.") from None
+            fault = "was encoded from other data, with another codec or other clips" if stale else "is not in the cache"
+            raise ConfigError(f"{path.parent}: the stream {stream} {fault}; {self.encoding.remedy}.") from None
         except (OSError, SafetensorError) as error:
             raise ConfigError(f"{path} is damaged ({error}); delete it and {self.encoding.remedy}.") from error
 
     def write(self, record: Record, stream: str, clips: np.ndarray) -> int:
-        """Write one stream of all clips of an episode, whole or not at all, and return its size in bytes.
+        """Write all clips of a stream atomically, and return their size in bytes.
 
         Args:
             clips: latents [clips t h w c], stored as float16, or numbers [clips t n], stored as float32.
@@ -85,12 +83,12 @@ class LatentCache:
 
 
 def open_cache(encoding: Encoding) -> LatentCache:
-    """Open the cache with its codec. Raises ConfigError if the codec's weights are missing or damaged."""
+    """Open the cache with its codec. Raises ConfigError as `load_codec`."""
     return LatentCache(encoding, load_codec(encoding))
 
 
 def load_codec(encoding: Encoding) -> Codec:
-    """The codec that the latents are made with. Raises ConfigError if its weights are missing, damaged or of another kind."""
+    """The codec of an encoding. Raises ConfigError if its weights are missing, damaged or of another kind."""
     if encoding.start_from is None:
         return encoding.kind.open(encoding.codec)
     return load_kept_codec(encoding.kind, encoding.start_from / RUN_CODEC, RUN_REMEDY)

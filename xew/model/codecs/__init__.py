@@ -1,7 +1,7 @@
-"""Video codecs: frames to latents and back, the names of published weights, and the ceiling that a codec sets.
+"""Video codecs: frames to latents and back, published weights, and a codec's reconstruction ceiling.
 
-Every codec is causal in time: it encodes the first frame alone, then groups of four. `contract.py` says what each promises,
-`codec.py` lists them.
+Every codec is causal in time: it encodes the first frame alone, then groups of four. `contract.py` defines the interface,
+`codec.py` is the registry.
 """
 
 __all__ = [

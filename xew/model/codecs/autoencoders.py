@@ -1,4 +1,4 @@
-"""Codecs of trained autoencoders: the project's own (`conv_autoencoder`, the default) and Wan2.2's (`wan_vae`)."""
+"""Codecs from trained autoencoders: the package's (`conv_autoencoder`, the default) and Wan2.2's (`wan_vae`)."""
 
 import functools
 import hashlib
@@ -12,36 +12,31 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
-from jax import Array
-from jaxtyping import Float
 
 from xew.config import ConfigError, parse, pick
 from xew.files import read_json, write_text
 from xew.model.codecs.contract import Codec, CodecSettings, FrameBatch, LatentBatch, LatentSize, to_pictures, to_signed
-from xew.model.codecs.conv_autoencoder import (
-    AutoencoderSize,
-    ConvAutoencoder,
-    load_autoencoder,
-    read_size,
-    save_autoencoder,
-)
+from xew.model.codecs.conv_autoencoder import ConvAutoencoder, load_autoencoder, read_size, save_autoencoder
 from xew.model.codecs.vae import VAES, VaeSize, VideoVae, abstract_vae, check_size
 from xew.model.codecs.vae_layouts import load_vae, save_vae
 
 PACKAGED_WEIGHTS = Path(__file__).with_name("conv_autoencoder.safetensors")
-"""Weights of conv_autoencoder that come with the package."""
+"""Packaged weights of conv_autoencoder."""
 
 
+@dataclass(frozen=True)
 class AutoencoderCodec(Codec):
-    """What the codecs of autoencoders share: the network, and that its weights are written once."""
+    """Base class of both codecs: the network, and saving its weights once."""
 
     file: ClassVar[str]
-    """Name of the files of the codec, without ending."""
+    """Name of the codec's files, without suffix."""
 
     params: Any
+    """State of the autoencoder, with the statistics of its latents."""
     graph: nnx.GraphDef
     size: Any
     dtype: str
+    hash: str
 
     @property
     def spatial_factor(self) -> int:
@@ -53,19 +48,26 @@ class AutoencoderCodec(Codec):
 
     @property
     def autoencoder(self) -> Any:
-        """The autoencoder itself."""
+        """The autoencoder's module."""
         return nnx.merge(self.graph, self.params)
+
+    @abstractmethod
+    def decode_last(self, latents: LatentBatch) -> FrameBatch:
+        """Latents [b t' h' w' c] -> the last frame [b 1 h w 3] that `decode_batch` gives."""
+
+    def next_reference(self, latents: LatentBatch) -> LatentBatch:
+        return self.encode_batch(to_signed(to_pictures(self.decode_last(latents))))
 
     @abstractmethod
     def write_weights(self, path: Path) -> None:
         """Write the weights as .safetensors."""
 
     def describe(self) -> dict[str, Any]:
-        """What `load` needs beside the weights."""
+        """Settings that `load` needs besides the weights."""
         return {"size": asdict(self.size), "dtype": self.dtype}
 
     def save(self, folder: Path) -> None:
-        """Write <file>.safetensors and <file>.json; weights that are there already are not written again."""
+        """Write <file>.safetensors, unless it exists with the same hash, and <file>.json."""
         file = folder / f"{self.file}.json"
         if not file.exists() or read_json(file)["hash"] != self.hash:
             self.write_weights(file.with_suffix(".safetensors"))
@@ -73,8 +75,8 @@ class AutoencoderCodec(Codec):
 
 
 @dataclass(frozen=True)
-class _KeptVae:
-    """Contents of vae.json."""
+class _StoredVae:
+    """Content of vae.json."""
 
     size: VaeSize
     dtype: Literal["float32", "bfloat16"]
@@ -83,37 +85,25 @@ class _KeptVae:
 
 
 @functools.partial(
-    jax.tree_util.register_dataclass, data_fields=("params",), meta_fields=("graph", "size", "dtype", "chunk", "hash")
+    jax.tree_util.register_dataclass, data_fields=("params",), meta_fields=("graph", "size", "dtype", "hash", "chunk")
 )
 @dataclass(frozen=True)
 class WanVaeCodec(AutoencoderCodec):
-    """Wan2.2's autoencoder, or a smaller one of its kind, with trained weights; see `xew.model.codecs.vae`."""
+    """Wan2.2's autoencoder, or a smaller size, with trained weights; see `xew.model.codecs.vae`."""
 
     file: ClassVar[str] = "vae"
 
-    params: Any
-    """State of a `VideoVae` with the statistics of its latents."""
-    graph: nnx.GraphDef
-    size: VaeSize
-    dtype: str
     chunk: int
-    hash: str
 
     def encode_batch(self, frames: FrameBatch) -> LatentBatch:
-        """Frames [b t h w 3] in [-1, 1] -> latents [b t' h' w' c] float32: normalized means, as Wan's diffusion takes them."""
         return self.autoencoder.encode(frames, self.chunk)
 
     def decode_batch(self, latents: LatentBatch) -> FrameBatch:
-        """Latents [b t' h' w' c] -> frames [b t h w 3] float32 in [-1, 1]."""
         return self.autoencoder.decode(latents, self.chunk)
 
-    def next_reference(self, latents: LatentBatch) -> Float[Array, "b 1 y x c"]:
-        """The last decoded frame as a picture, encoded alone: [b t' h' w' c] -> [b 1 h' w' c].
-
-        It decodes two latents at a time, so that it fits beside a network in training.
-        """
-        last = self.autoencoder.decode(latents, chunk=2, last_only=True)
-        return self.autoencoder.encode(to_signed(to_pictures(last)))
+    def decode_last(self, latents: LatentBatch) -> FrameBatch:
+        """Decode two latents at a time, to leave memory for a network in training."""
+        return self.autoencoder.decode(latents, chunk=2, last_only=True)
 
     def write_weights(self, path: Path) -> None:
         save_vae(self.autoencoder, path)
@@ -123,17 +113,16 @@ class WanVaeCodec(AutoencoderCodec):
 
     @classmethod
     def load(cls, folder: Path) -> "WanVaeCodec":
-        """Read vae.safetensors and vae.json."""
-        stored = read_json(folder / "vae.json")
-        kept = parse(_KeptVae, stored, str(folder / "vae.json"))
-        check_size(kept.size, str(folder / "vae.json"))
-        return cls.from_weights(folder / "vae.safetensors", kept.size, kept.dtype, kept.chunk)
+        file = folder / "vae.json"
+        stored = parse(_StoredVae, read_json(file), str(file))
+        check_size(stored.size, str(file))
+        return cls.from_weights(folder / "vae.safetensors", stored.size, stored.dtype, stored.chunk)
 
     @classmethod
     def latent_size(cls, settings: CodecSettings) -> LatentSize:
         size = pick(VAES, settings.vae, "autoencoder")
         if settings.chunk < 0:
-            raise ConfigError(f"codec.chunk is {settings.chunk}; expected latent frames at once, or 0 for all.")
+            raise ConfigError(f"codec.chunk is {settings.chunk}; expected a number of latent frames, or 0 for all.")
         return LatentSize(size.spatial_factor, size.channels)
 
     @classmethod
@@ -146,7 +135,7 @@ class WanVaeCodec(AutoencoderCodec):
 
     @classmethod
     def from_weights(cls, weights: Path, size: VaeSize, dtype: str = "float32", chunk: int = 8) -> "WanVaeCodec":
-        """A codec from a file of weights of any known kind."""
+        """A codec from weights in any known layout."""
         vae = abstract_vae(size, jnp.dtype(dtype))
         load_vae(vae, weights)
         return cls.from_vae(vae, chunk)
@@ -156,46 +145,31 @@ class WanVaeCodec(AutoencoderCodec):
         """The codec of an autoencoder."""
         graph, params = nnx.split(vae)
         dtype = jnp.dtype(vae.dtype).name
-        return cls(params, graph, vae.size, dtype, chunk, hash_leaves(f"wan_vae {vae.size} {dtype}", params))
+        return cls(params, graph, vae.size, dtype, hash_leaves(f"wan_vae {vae.size} {dtype}", params), chunk)
 
 
 @functools.partial(jax.tree_util.register_dataclass, data_fields=("params",), meta_fields=("graph", "size", "dtype", "hash"))
 @dataclass(frozen=True)
 class ConvAutoencoderCodec(AutoencoderCodec):
-    """The project's own autoencoder of groups of four frames; see `xew.model.codecs.conv_autoencoder`.
-
-    Groups are independent: of the latents and decoded frames, only the first depends on the first frame.
-    """
+    """The package's autoencoder of groups of four frames; see `xew.model.codecs.conv_autoencoder`."""
 
     file: ClassVar[str] = "autoencoder"
     groups_independent: ClassVar[bool] = True
 
-    params: Any
-    """State of a `ConvAutoencoder` with the statistics of its latents."""
-    graph: nnx.GraphDef
-    size: AutoencoderSize
-    dtype: str
-    hash: str
-
     def encode_batch(self, frames: FrameBatch) -> LatentBatch:
-        """Frames [b t h w 3] in [-1, 1] -> standardized latents [b t' h' w' c] float32."""
         return self.autoencoder.encode(frames)
 
     def decode_batch(self, latents: LatentBatch) -> FrameBatch:
-        """Latents [b t' h' w' c] -> frames [b t h w 3] float32 in [-1, 1]."""
         return self.autoencoder.decode(latents)
 
-    def next_reference(self, latents: LatentBatch) -> Float[Array, "b 1 y x c"]:
-        """The last decoded frame as a picture, encoded alone: [b t' h' w' c] -> [b 1 h' w' c]; one group is decoded."""
-        autoencoder = self.autoencoder
-        return autoencoder.encode(to_signed(to_pictures(autoencoder.decode_last(latents))))
+    def decode_last(self, latents: LatentBatch) -> FrameBatch:
+        return self.autoencoder.decode_last(latents)
 
     def write_weights(self, path: Path) -> None:
         save_autoencoder(self.autoencoder, path)
 
     @classmethod
     def load(cls, folder: Path) -> "ConvAutoencoderCodec":
-        """Read autoencoder.safetensors and autoencoder.json."""
         stored = read_json(folder / "autoencoder.json")
         return cls.from_weights(folder / "autoencoder.safetensors", stored["dtype"])
 
@@ -210,7 +184,7 @@ class ConvAutoencoderCodec(AutoencoderCodec):
 
     @classmethod
     def from_weights(cls, weights: Path, dtype: str = "float32") -> "ConvAutoencoderCodec":
-        """A codec from a file of weights, or from the folder that holds it."""
+        """A codec from a file of weights, or from its folder."""
         return cls.from_autoencoder(load_autoencoder(weights, jnp.dtype(dtype)))
 
     @classmethod
@@ -223,7 +197,7 @@ class ConvAutoencoderCodec(AutoencoderCodec):
 
 
 def hash_leaves(name: str, params: Any) -> str:
-    """SHA-256 of a name and of all leaves of a module's state with their paths."""
+    """SHA-256 of a name and a module's state."""
     digest = hashlib.sha256(name.encode())
     for path, leaf in sorted(nnx.to_flat_state(params), key=lambda item: str(item[0])):
         digest.update(f"{path}".encode())

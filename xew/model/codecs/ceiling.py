@@ -1,8 +1,4 @@
-"""The ceiling: what is left of true video after the codec, and so what no rollout at this size can exceed.
-
-Reads  videos, codec
-Writes `Ceiling`
-"""
+"""The codec ceiling: the quality of true video after the codec, which no rollout can exceed."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -18,7 +14,7 @@ from xew.model.video.frames import to_camera_size, to_model_size
 T = TypeVar("T")
 
 LPIPS_EVERY = 3
-"""Number of frames between those on which LPIPS is taken: not 4, so that each place in a group of four gets its turn."""
+"""Interval of the frames graded by LPIPS; 3 and not 4, to cover all positions in a group of four."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +33,7 @@ class Ceiling:
 
 
 def check_lpips() -> None:
-    """Raise ConfigError unless the weights of LPIPS are installed, before long work that needs them at its end."""
+    """Raise ConfigError unless the weights of LPIPS are installed."""
     from xew.metrics.grading.weights import check_weights
 
     check_weights(("lpips",))
@@ -46,10 +42,7 @@ def check_lpips() -> None:
 def measure_ceiling(
     codec: Codec, videos: Iterable[UInt8[np.ndarray, "_ h w 3"]], frames: int, height: int, width: int
 ) -> Ceiling:
-    """Grade what is left of the first `frames` frames of each video after encoding and decoding.
-
-    Each is true video, uint8 [t 240 320 3]; what a shorter one is continued by is not graded.
-    """
+    """Grade the reconstruction of the first `frames` frames of each true video, uint8 [t 240 320 3]."""
     from xew.metrics import lpips, psnr
 
     scores = []
@@ -64,14 +57,14 @@ def measure_ceiling(
 def reconstruct(
     codec: Codec, truth: UInt8[np.ndarray, "t 240 320 3"], frames: int, height: int, width: int
 ) -> UInt8[np.ndarray, "t 240 320 3"]:
-    """What the codec leaves of a video, at the camera's size: [t 240 320 3] uint8.
+    """Reconstruction of a video of at most `frames` frames by the codec, at the camera's size: [t 240 320 3] uint8.
 
-    The video has at most `frames` frames; fewer are continued by their last one, which is not returned.
+    A shorter video is padded with its last frame for the codec.
     """
     clip = truth[np.minimum(np.arange(frames), len(truth) - 1)]
     return to_camera_size(codec.decode(codec.encode(to_model_size(clip, height, width))))[: len(truth)]
 
 
 def choose_evenly(items: Sequence[T], count: int) -> list[T]:
-    """At most `count` of the items, at even distances."""
+    """At most `count` of the items, evenly spaced."""
     return [items[i] for i in np.unique(np.linspace(0, len(items) - 1, min(len(items), count)).astype(int))]

@@ -1,6 +1,6 @@
-"""The registry of codecs, and codecs that are kept in a folder. What each promises is said in contract.py.
+"""The registry of codecs, and loading a codec from a folder.
 
-To add one: a class with the methods of `Codec`, and one line in CODECS.
+To add a codec: a class with the methods of `Codec` (contract.py), and one line in CODECS.
 """
 
 from pathlib import Path
@@ -15,13 +15,13 @@ CODECS: dict[str, type[Codec]] = {
 }
 
 RUN_CODEC = "codec"
-"""Name of the folder in a run that holds its codec."""
+"""Name of the folder of a run's codec."""
 RUN_REMEDY = "copy the whole run again, or train again"
-"""Sentence on what to do where a run's codec is damaged or lost."""
+"""Remedy if a run's codec is damaged or lost."""
 
 
 def codec_class(settings: CodecSettings) -> type[Codec]:
-    """The class of codec that a config names. Raises ConfigError if there is none of that name."""
+    """The codec class of a config. Raises ConfigError if the name is unknown."""
     return pick(CODECS, settings.name, "codec")
 
 
@@ -31,17 +31,13 @@ def latent_size(settings: CodecSettings) -> LatentSize:
 
 
 def load_kept_codec(kind: type[Codec], folder: Path, remedy: str) -> Codec:
-    """The codec of this class that is kept in a folder.
-
-    Raises:
-        ConfigError: the folder lacks a file or is damaged; `remedy` says what to do.
-    """
+    """Load a codec of this class from a folder. Raises ConfigError with `remedy` if a file is missing or damaged."""
     try:
         return kind.load(folder)
     except ConfigError:
         raise
     except FileNotFoundError as error:
         raise ConfigError(f"{folder.parent} lacks its codec ({error.filename}); {remedy}.") from error
-    except Exception as error:  # zipfile, zlib, NumPy and safetensors each have their own
+    except Exception as error:  # zipfile, zlib, NumPy and safetensors each raise their own
         reason = " ".join(str(error).split())[:200] or type(error).__name__
         raise ConfigError(f"{folder} is damaged ({reason}); {remedy}.") from error

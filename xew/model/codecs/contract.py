@@ -1,10 +1,9 @@
-"""What every codec promises: frames to latents and back, causally, the first frame alone and then groups of four.
+"""The interface of codecs: frames to latents and back, causally, the first frame alone and then groups of four.
 
 Reads  uint8 [t h w 3], or on the device float [b t h w 3] in [-1, 1]; t = 4 k + 1
 Writes float32 latents [k + 1, h / factor, w / factor, channels] of about unit size
-To add a codec: a class with the methods of `Codec`, and one line in CODECS (codec.py).
 
-A codec is a JAX pytree of its arrays, so that it is passed to compiled functions and is no constant in them.
+A codec is a JAX pytree of its arrays, so it is an argument of compiled functions and not a constant.
 """
 
 from abc import ABC, abstractmethod
@@ -33,36 +32,35 @@ class CodecSettings:
     name: str = "conv_autoencoder"
     """One of CODECS."""
     weights: Path | None = None
-    """Weights of conv_autoencoder; the package's own if left out. Of wan_vae: Wan2.2_VAE.pth, or the vae folder of the
-    diffusers layout."""
+    """Weights of conv_autoencoder (default: the packaged ones), or of wan_vae: Wan2.2_VAE.pth or diffusers' vae folder."""
     vae: str = "wan22"
     """Size of wan_vae, one of VAES."""
     dtype: Literal["float32", "bfloat16"] = "float32"
-    """Type of the activations of wan_vae and conv_autoencoder."""
+    """Type of the activations."""
     chunk: int = 8
-    """Number of latent frames that go through wan_vae at once; more is faster and takes more memory, 0 takes all."""
+    """Number of latent frames that wan_vae codes at once, 0 for all; more is faster and takes more memory."""
 
 
 class LatentSize(NamedTuple):
-    """What a network needs to know of its latents."""
+    """Spatial factor and channels of a codec's latents."""
 
     spatial_factor: int
-    """Number of pixels a side of a latent."""
+    """Number of pixels per latent along a side."""
     channels: int
 
 
 class Codec(ABC):
-    """What the rest of the package asks of a codec."""
+    """The interface of a codec."""
 
     groups_independent: ClassVar[bool] = False
     """Whether the first frame and each later group of four are coded independently, so a video may be coded in pieces."""
     hash: str
-    """Text that changes whenever latents would."""
+    """Identifier that changes whenever the latents would."""
 
     @property
     @abstractmethod
     def spatial_factor(self) -> int:
-        """Number of pixels a side of a latent."""
+        """Number of pixels per latent along a side."""
 
     @property
     @abstractmethod
@@ -72,9 +70,8 @@ class Codec(ABC):
     def encode(self, video: Pictures) -> Latents:
         """Video uint8 [t h w 3] -> latents float32 [t' h' w' c]; t must be 4 k + 1 and the sides multiples of the factor.
 
-        Later frames never change earlier latents.
+        Later frames never change earlier latents. Raises ValueError for other shapes.
         """
-        check_clip_shape(video.shape, self.spatial_factor)
         return np.asarray(encode_pictures(self, video[None]))[0]
 
     def decode(self, latents: Latents) -> Pictures:
@@ -93,26 +90,22 @@ class Codec(ABC):
     def next_reference(self, latents: LatentBatch) -> Float[Array, "b 1 y x c"]:
         """The last frame of a decoded clip, encoded alone: [b t' h' w' c] -> [b 1 h' w' c]; may be traced.
 
-        It is rounded as if it had been a picture in between, so it is what a rollout begins its next chunk with.
+        The frame is rounded to uint8 in between, as the reference of a rollout's next chunk is.
         """
 
     @abstractmethod
     def save(self, folder: Path) -> None:
-        """Write all that `load` needs into a folder, under names of its own."""
+        """Write the files that `load` needs into a folder."""
 
     @classmethod
     @abstractmethod
     def load(cls, folder: Path) -> "Codec":
-        """The codec that was saved in a folder."""
+        """Load a codec that `save` wrote."""
 
     @classmethod
     @abstractmethod
     def latent_size(cls, settings: CodecSettings) -> LatentSize:
-        """Spatial factor and channels of a config's codec; at most the header of its weights is read.
-
-        Raises:
-            ConfigError: the settings or the weights cannot be used.
-        """
+        """Size of a config's latents, from at most the header of the weights. Raises ConfigError if it cannot be read."""
 
     @classmethod
     @abstractmethod
@@ -142,13 +135,6 @@ def to_pictures(frames: Float[Array, "*n"]) -> UInt8[Array, "*n"]:
     return jnp.clip(jnp.rint((frames + 1) * 127.5), 0, 255).astype(jnp.uint8)
 
 
-def check_clip_shape(shape: tuple[int, ...], spatial_factor: int) -> None:
-    """Raise ValueError unless a clip [t h w 3] can be encoded."""
-    t, h, w, _ = shape
-    if t % TEMPORAL_FACTOR != 1 or h % spatial_factor or w % spatial_factor:
-        raise ValueError(f"a clip of {t} frames {w}x{h} cannot be encoded: it needs 4 k + 1 frames, sides in {spatial_factor}s")
-
-
 def latent_frames(frames: int) -> int:
-    """Number of latent frames that 4 k + 1 frames of video become."""
+    """Number of latent frames of 4 k + 1 frames of video."""
     return (frames - 1) // TEMPORAL_FACTOR + 1

@@ -1,12 +1,11 @@
-"""A convolutional autoencoder of groups of four frames (Flax NNX): small, two-dimensional, each group by itself.
+"""A small two-dimensional convolutional autoencoder that codes each group of four frames independently (Flax NNX).
 
-Reads  frames [b t h w 3] in [-1, 1], t = 4 k + 1; the first frame is a group of its own, taken four times
+Reads  frames [b t h w 3] in [-1, 1], t = 4 k + 1; the first frame, repeated four times, is a group
 Writes latents [b k+1 h/factor w/factor c], and frames back
 To add a size: one line in AUTOENCODERS.
 
-The four frames of a group and small squares of pixels are channels from the first layer on, so that there is no convolution
-over time: what a latent says depends on its own group alone, and so does what is decoded from it. Sides are halved by taking
-squares of pixels into the channels and mixing these (Shi et al., arXiv 1609.05158, in both directions).
+The frames of a group and patches of pixels are stacked in the channels, so there is no convolution over time. Sides are
+halved by moving 2x2 pixels into the channels and mixing these (Shi et al., arXiv 1609.05158, in both directions).
 
 Shape letters: b batch, n groups, t h w video, i o channels in and out.
 """
@@ -31,7 +30,7 @@ from safetensors.numpy import save_file
 from xew.config import ConfigError, parse
 from xew.files import demand_regular, replacing
 from xew.model.codecs.vae import LatentStatistic
-from xew.model.codecs.vae_layers import Conv, Layers, RmsNorm, as_row, patchify, unpatchify
+from xew.model.codecs.vae_layers import Conv, Layers, RmsNorm, as_row, check_frames, patchify, unpatchify
 from xew.model.video.frames import TEMPORAL_FACTOR
 from xew.model.weights.filling import fill
 from xew.model.weights.layout import Source, module_leaves
@@ -42,33 +41,31 @@ Features = Float[Array, "n y x c"]
 Inputs = Float[Array, "n y x i"]
 Outputs = Float[Array, "n y2 x2 o"]
 SIZE = "size"
-"""Entry of a weights file's metadata that holds the size of the autoencoder, in JSON."""
+"""Metadata key of a weights file with the size of the autoencoder, in JSON."""
 
 
 @dataclass(frozen=True)
 class AutoencoderSize:
-    """Everything that distinguishes one size of the autoencoder from another."""
+    """Hyperparameters of a `ConvAutoencoder`; stages are listed from pixels to latents and halve the sides in between."""
 
     encoder_widths: tuple[int, ...]
-    """Widths of the encoder's stages, from pixels to latents; between two stages the sides are halved."""
     encoder_blocks: tuple[int, ...]
     """Numbers of residual blocks of the encoder's stages."""
     decoder_widths: tuple[int, ...]
-    """Widths of the decoder's stages, in the same order: from pixels to latents."""
     decoder_blocks: tuple[int, ...]
     channels: int = 48
     """Number of channels of the latents."""
     patch: int = 4
-    """Number of pixels a side that become channels before the first layer."""
+    """Side of the patches that become channels before the first layer [pixels]."""
 
     def __post_init__(self) -> None:
         stages = (self.encoder_widths, self.encoder_blocks, self.decoder_widths, self.decoder_blocks)
         if len({len(stage) for stage in stages}) != 1:
-            raise ValueError(f"{self}: encoder and decoder have as many stages, each with a width and a number of blocks")
+            raise ValueError(f"{self}: expected as many stages, each with a width and blocks, in the encoder as in the decoder")
 
     @property
     def spatial_factor(self) -> int:
-        """Number of pixels a side of a latent."""
+        """Number of pixels per latent along a side."""
         return self.patch * 2 ** (len(self.encoder_widths) - 1)
 
 
@@ -83,7 +80,7 @@ class ConvAutoencoder(nnx.Module):
 
     Args:
         size: one of `AUTOENCODERS`.
-        dtype: of activations and products; parameters stay float32, norms are computed in it.
+        dtype: of activations and matrix products; parameters and norms are float32.
     """
 
     def __init__(self, size: AutoencoderSize, *, dtype: DTypeLike = jnp.float32, rngs: nnx.Rngs) -> None:
@@ -94,24 +91,21 @@ class ConvAutoencoder(nnx.Module):
         self.latents_std = LatentStatistic(jnp.ones(size.channels))
 
     def encode_groups(self, groups: Groups) -> Features:
-        """Latents [n h' w' c] float32, not standardized, of groups of frames [n 4 h w 3] in [-1, 1]."""
+        """Groups of frames [n 4 h w 3] in [-1, 1] -> latents [n h' w' c] float32, not standardized."""
         n, _, h, w, _ = groups.shape
         stacked = groups.astype(self.dtype).transpose(0, 2, 3, 1, 4).reshape(n, 1, h, w, TEMPORAL_FACTOR * 3)
         return self.encoder(patchify(stacked, self.size.patch)[:, 0]).astype(jnp.float32)
 
     def decode_groups(self, latents: Features) -> Groups:
-        """Groups of frames [n 4 h w 3] float32, not clipped, of latents [n h' w' c] that are not standardized."""
+        """Latents [n h' w' c], not standardized -> groups of frames [n 4 h w 3] float32, not clipped."""
         stacked = unpatchify(self.decoder(latents.astype(self.dtype))[:, None], self.size.patch)[:, 0]
         n, h, w, _ = stacked.shape
         return stacked.astype(jnp.float32).reshape(n, h, w, TEMPORAL_FACTOR, 3).transpose(0, 3, 1, 2, 4)
 
     def encode(self, frames: Float[Array, "b t h w 3"]) -> Float[Array, "b k y x c"]:
-        """Standardized latents [b k+1 h' w' c] float32 of frames [b t h w 3] in [-1, 1], t = 4 k + 1."""
-        b, t, h, w, _ = frames.shape
-        if t % TEMPORAL_FACTOR != 1 or h % self.size.spatial_factor or w % self.size.spatial_factor:
-            raise ValueError(
-                f"frames are {frames.shape}; expected [b t h w 3] with t = 4 k + 1 and sides in {self.size.spatial_factor}s"
-            )
+        """Frames [b t h w 3] in [-1, 1], t = 4 k + 1 -> standardized latents [b k+1 h' w' c] float32."""
+        check_frames(frames.shape, self.size.spatial_factor)
+        b, _, h, w, _ = frames.shape
         first = jnp.repeat(frames[:, :1], TEMPORAL_FACTOR - 1, axis=1)
         groups = jnp.concatenate([first, frames], axis=1).reshape(-1, TEMPORAL_FACTOR, h, w, 3)
         latents = self.encode_groups(groups)
@@ -119,7 +113,7 @@ class ConvAutoencoder(nnx.Module):
         return standard.reshape(b, -1, *standard.shape[1:])
 
     def decode(self, latents: Float[Array, "b k y x c"]) -> Float[Array, "b t h w 3"]:
-        """Frames [b t h w 3] float32 in [-1, 1] of standardized latents [b k+1 h' w' c]; the first is the mean of its four."""
+        """Standardized latents [b k+1 h' w' c] -> frames [b t h w 3] float32 in [-1, 1]; frame 0 is the mean of its group."""
         b, k = latents.shape[:2]
         groups = self._decode_standard(latents.reshape(b * k, *latents.shape[2:]))
         groups = groups.reshape(b, k, *groups.shape[1:])
@@ -128,7 +122,7 @@ class ConvAutoencoder(nnx.Module):
         return jnp.clip(jnp.concatenate([first, later], axis=1), -1, 1)
 
     def decode_last(self, latents: Float[Array, "b k y x c"]) -> Float[Array, "b 1 h w 3"]:
-        """The last frame [b 1 h w 3] that `decode` gives of latents [b k+1 h' w' c]; no other group is decoded."""
+        """Latents [b k+1 h' w' c] -> the last frame [b 1 h w 3] of `decode`, without decoding other groups."""
         groups = self._decode_standard(latents[:, -1])
         last = groups[:, -1:] if latents.shape[1] > 1 else groups.mean(axis=1, keepdims=True)
         return jnp.clip(last, -1, 1)
@@ -197,7 +191,7 @@ class Stage(nnx.Module):
 
 
 class Block(nnx.Module):
-    """Two convolutions, each after a norm, beside a shortcut: [n y x c] -> [n y x c]. It begins as the shortcut alone."""
+    """Residual block of two convolutions after norms: [n y x c] -> [n y x c]. It starts as the identity."""
 
     def __init__(self, width: int, layers: Layers) -> None:
         self.norm1, self.norm2 = RmsNorm(width), RmsNorm(width)
@@ -211,17 +205,17 @@ class Block(nnx.Module):
 
 
 def convolve(conv: Conv, x: Inputs) -> Float[Array, "n y x o"]:
-    """Convolve pictures [n y x i] with a kernel [3 3 i o], zeros around them: [n y x o]."""
+    """Convolve pictures [n y x i] with a kernel [3 3 i o] and zero padding: [n y x o]."""
     return conv.apply(x, stride=1, padding=((1, 1), (1, 1)))
 
 
 def abstract_autoencoder(size: AutoencoderSize, dtype: DTypeLike = jnp.float32) -> ConvAutoencoder:
-    """An autoencoder whose leaves have no values yet; weights are loaded into it."""
+    """An autoencoder without parameter values, to load weights into."""
     return nnx.eval_shape(lambda: ConvAutoencoder(size, dtype=dtype, rngs=nnx.Rngs(0)))
 
 
 def save_autoencoder(autoencoder: ConvAutoencoder, path: Path) -> None:
-    """Write an autoencoder as .safetensors that says its own size: kernels rounded to bfloat16, the rest in float32.
+    """Write an autoencoder and its size as .safetensors: kernels in bfloat16, the rest in float32.
 
     Raises:
         ConfigError: the file cannot be written.
@@ -239,7 +233,7 @@ def save_autoencoder(autoencoder: ConvAutoencoder, path: Path) -> None:
 
 
 def load_autoencoder(path: Path, dtype: DTypeLike = jnp.float32) -> ConvAutoencoder:
-    """Read an autoencoder that `save_autoencoder` wrote; a folder stands for the one .safetensors in it.
+    """Read an autoencoder that `save_autoencoder` wrote, from its file or the folder of that file.
 
     Raises:
         ConfigError: there is no such file, it is broken, or it is of another kind.
@@ -250,10 +244,10 @@ def load_autoencoder(path: Path, dtype: DTypeLike = jnp.float32) -> ConvAutoenco
 
 
 def read_size(path: Path) -> AutoencoderSize:
-    """The size of an autoencoder, from the header of its weights. Raises ConfigError as `load_autoencoder`."""
+    """Size of an autoencoder, from the header of its weights. Raises ConfigError as `load_autoencoder`."""
     file = find_weights(path)
     if not file.is_file():
-        raise ConfigError(f"there are no weights at {file}; name a file or a folder that exists by codec.weights.")
+        raise ConfigError(f"there are no weights at {file}; set codec.weights to a file or folder that exists.")
     return _read_size(file, file.stat().st_mtime_ns)
 
 
@@ -263,18 +257,18 @@ def _read_size(file: Path, _: int) -> AutoencoderSize:
         with safe_open(demand_regular(file), framework="numpy") as stored:
             metadata = stored.metadata() or {}
     except SafetensorError as error:
-        raise ConfigError(f"{file} is no whole safetensors file ({error}); copy it again.") from error
+        raise ConfigError(f"{file} is not a whole safetensors file ({error}); copy it again.") from error
     if SIZE not in metadata:
-        raise ConfigError(f"{file} does not say the size of its autoencoder; expected weights that xew wrote.")
+        raise ConfigError(f"{file} does not hold the size of its autoencoder; expected weights that xew wrote.")
     return parse(AutoencoderSize, json.loads(metadata[SIZE]), str(file))
 
 
 def find_weights(path: Path) -> Path:
-    """The file of weights that a path names: itself, or the one .safetensors of a folder. Raises ConfigError if none."""
+    """The path itself, or the only .safetensors of a folder. Raises ConfigError if the folder has none or several."""
     if not path.is_dir():
         return path
     files = sorted(path.glob("*.safetensors"))
     if len(files) != 1:
-        found = ", ".join(file.name for file in files) or "no .safetensors"
-        raise ConfigError(f"{path} holds {found}; name one file of weights.")
+        names = ", ".join(file.name for file in files) or "no .safetensors"
+        raise ConfigError(f"{path} holds {names}; expected the path of one file of weights.")
     return files[0]

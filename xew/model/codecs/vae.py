@@ -1,13 +1,13 @@
-"""The video autoencoder of Wan2.2 at any size (Flax NNX): causal in time, four frames and 8 or 16 pixels a side a latent.
+"""The video autoencoder of Wan2.2 at any size (Flax NNX), causal in time; a latent covers four frames and 8 or 16 pixels.
 
 Reads  frames [b t h w 3] in [-1, 1], t = 4 k + 1
 Writes means and log variances of latents [b k+1 h/factor w/factor c], and frames back
 To add a size: one line in VAES.
 
-Every layer looks only backwards in time, so a video may go through in one pass or chunk by chunk with the last frames of
-each layer kept (`History`); both are the same function. The first frame is coded alone and never halved or doubled in time.
+A video is coded in one pass, or in chunks with the last input frames of each layer (`History`) and the same result. The first
+frame is coded alone and never halved or doubled in time.
 
-Source: Wan2.2 (github.com/Wan-Video/Wan2.2, vae2_2.py, Apache-2.0); its chunks of one and four frames are a special case.
+Source: Wan2.2 (github.com/Wan-Video/Wan2.2, vae2_2.py, Apache-2.0).
 Shape letters: b batch, t h w c video, i o channels in and out.
 """
 
@@ -32,6 +32,7 @@ from xew.model.codecs.vae_layers import (
     Upsample,
     as_row,
     average_groups,
+    check_frames,
     patchify,
     repeat_groups,
     unpatchify,
@@ -40,8 +41,7 @@ from xew.model.codecs.vae_layers import (
 LOG_VARIANCE_RANGE = (-30.0, 20.0)
 """Limits that log variances are clipped to."""
 PUBLISHED_STATISTICS = Path(__file__).with_name("wan22_latents.json")
-"""Mean and deviation of Wan2.2's latents, which its code holds."""
-
+"""Mean and standard deviation of Wan2.2's latents, from its code."""
 
 Video = Float[Array, "b t h w 3"]
 Latents = Float[Array, "b k y x c"]
@@ -49,51 +49,51 @@ Latents = Float[Array, "b k y x c"]
 
 @dataclass(frozen=True)
 class VaeSize:
-    """Everything that distinguishes one size of the autoencoder from another."""
+    """Hyperparameters of a `VideoVae`; stages are listed from pixels to latents, and all but the last halve the sides."""
 
     channels: int
     """Number of channels of the latents."""
     encoder_dim: int
     decoder_dim: int
     multipliers: tuple[int, ...]
-    """Factors of the widths, one a stage from pixels to latents; every stage but the last halves the sides."""
+    """Width of each stage as a multiple of the encoder's or decoder's width."""
     halve_time: tuple[bool, ...]
-    """Whether a stage halves time, for every stage but the last in the same order; two of them do, which makes four."""
+    """Whether each stage but the last halves time; exactly two do."""
     blocks: int = 2
-    """Number of residual blocks a stage of the encoder; the decoder has one more."""
+    """Number of residual blocks in a stage of the encoder; the decoder has one more."""
     patch: int = 2
-    """Number of pixels a side that become channels before the first layer."""
+    """Side of the patches that become channels before the first layer [pixels]."""
 
     def __post_init__(self) -> None:
         if len(self.halve_time) != len(self.multipliers) - 1 or sum(self.halve_time) != 2:
-            raise ValueError(f"{self}: every stage but the last either halves time or does not, and exactly two do")
+            raise ValueError(f"{self}: expected halve_time for every stage but the last, true for exactly two")
 
     @property
     def spatial_factor(self) -> int:
-        """Number of pixels a side of a latent."""
+        """Number of pixels per latent along a side."""
         return self.patch * 2 ** len(self.halve_time)
 
     @property
     def encoder_widths(self) -> list[int]:
-        """Widths in front of each stage of the encoder and after the last."""
+        """Widths before each stage of the encoder and after the last."""
         return [self.encoder_dim * multiplier for multiplier in (1, *self.multipliers)]
 
     @property
     def decoder_widths(self) -> list[int]:
-        """Widths in front of each stage of the decoder and after the last."""
+        """Widths before each stage of the decoder and after the last."""
         return [self.decoder_dim * multiplier for multiplier in (self.multipliers[-1], *self.multipliers[::-1])]
 
 
 LARGEST_WIDTH, MOST_BLOCKS, LARGEST_MULTIPLIER = 4096, 64, 64
-"""Largest numbers that the description of an autoencoder in a file may give."""
+"""Largest values of a size that is read from a file."""
 
 
 def check_size(size: VaeSize, source: str) -> None:
-    """Raise ConfigError for a size that no autoencoder has, before a network is made of it."""
+    """Raise ConfigError if a size that was read from a file is out of range."""
     widths, multipliers = (size.channels, size.encoder_dim, size.decoder_dim, size.patch), size.multipliers
     wrong = not 0 < min(widths) <= max(widths) <= LARGEST_WIDTH or not 0 < size.blocks <= MOST_BLOCKS
     if wrong or not multipliers or not 0 < min(multipliers) <= max(multipliers) <= LARGEST_MULTIPLIER:
-        raise ConfigError(f"{source}: {size} is no size of an autoencoder; copy the whole run again.")
+        raise ConfigError(f"{source}: {size} is not a valid size of an autoencoder; copy the whole run again.")
 
 
 VAES = {
@@ -103,7 +103,7 @@ VAES = {
 
 
 class LatentStatistic(nnx.Variable):
-    """Mean or standard deviation of the latents, channel by channel; not trained."""
+    """Mean or standard deviation of the latents by channel; not trained."""
 
 
 class VideoVae(nnx.Module):
@@ -111,7 +111,7 @@ class VideoVae(nnx.Module):
 
     Args:
         size: one of `VAES`.
-        dtype: of activations and products; parameters stay float32, norms are computed in it.
+        dtype: of activations and matrix products; parameters and norms are float32.
     """
 
     def __init__(self, size: VaeSize, *, dtype: DTypeLike = jnp.float32, rngs: nnx.Rngs) -> None:
@@ -129,12 +129,12 @@ class VideoVae(nnx.Module):
 
         Args:
             frames: [b t h w 3] in [-1, 1]; t = 4 k + 1, sides multiples of the size's factor.
-            chunk: latent frames computed at once, at most, which bounds the memory; 0 computes all.
+            chunk: largest number of latent frames computed at once; 0 computes all.
 
         Returns:
             Two of [b k+1 h' w' c] float32.
         """
-        self._check(frames.shape)
+        check_frames(frames.shape, self.size.spatial_factor)
 
         def step(part: Array, history: History) -> Array:
             return self.encoder(patchify(part, self.size.patch), history)
@@ -145,19 +145,17 @@ class VideoVae(nnx.Module):
 
     def encode(self, frames: Video, chunk: int = 0) -> Latents:
         """Normalized mean latents [b k+1 h' w' c] float32 of frames [b t h w 3]; arguments as of `moments`."""
-        return self.normalize(self.moments(frames, chunk)[0])
+        mean = self.moments(frames, chunk)[0]
+        return (mean - as_row(self.latents_mean[...])) / as_row(self.latents_std[...])
 
     def decode(self, latents: Latents, chunk: int = 0, *, last_only: bool = False) -> Video:
-        """Frames of normalized latents.
+        """Frames [b t h w 3] float32 in [-1, 1] of normalized latents, t = 4 (t' - 1) + 1, or 1.
 
         Args:
             latents: [b t' h' w' c].
-            chunk: latent frames computed at once, at most; 0 computes all, which at Wan2.2's size and 121 frames of
-                320x256 makes tensors of more than 2^31 numbers, where not every convolution of cuDNN follows.
-            last_only: give the last frame alone; with a small `chunk` the others never lie in memory together.
-
-        Returns:
-            [b t h w 3] float32 in [-1, 1], t = 4 (t' - 1) + 1, or 1.
+            chunk: largest number of latent frames computed at once; 0 computes all. Wan2.2 at 121 frames of 320x256 then
+                makes tensors of more than 2^31 numbers, which not every convolution of cuDNN supports.
+            last_only: return the last frame alone; a small `chunk` then saves memory.
         """
 
         def step(part: Array, history: History) -> Array:
@@ -165,25 +163,13 @@ class VideoVae(nnx.Module):
             return frames[:, -1:] if last_only else frames
 
         chunk = even_chunk(latents.shape[1] - 1, chunk)
-        decoded = apply_in_chunks(step, self.post_quant(self.denormalize(latents).astype(self.dtype)), chunk)
+        means = latents.astype(jnp.float32) * as_row(self.latents_std[...]) + as_row(self.latents_mean[...])
+        decoded = apply_in_chunks(step, self.post_quant(means.astype(self.dtype)), chunk)
         return jnp.clip((decoded[:, -1:] if last_only else decoded).astype(jnp.float32), -1, 1)
-
-    def normalize(self, mean: Latents) -> Latents:
-        """Latents [b t' h' w' c] of about unit size, from those that `moments` gives."""
-        return (mean - as_row(self.latents_mean[...])) / as_row(self.latents_std[...])
-
-    def denormalize(self, latents: Latents) -> Latents:
-        """Latents [b t' h' w' c] float32 as `moments` gives them, the inverse of `normalize`."""
-        return latents.astype(jnp.float32) * as_row(self.latents_std[...]) + as_row(self.latents_mean[...])
-
-    def _check(self, shape: tuple[int, ...]) -> None:
-        factor = self.size.spatial_factor
-        if len(shape) != 5 or shape[1] % 4 != 1 or shape[2] % factor or shape[3] % factor or shape[4] != 3:
-            raise ValueError(f"frames are {shape}; expected [b t h w 3] with t = 4 k + 1 and sides in {factor}s")
 
 
 def abstract_vae(size: VaeSize, dtype: DTypeLike = jnp.float32) -> VideoVae:
-    """An autoencoder of which only the statistics have values yet; weights are loaded into it."""
+    """An autoencoder without parameter values (its statistics have values), to load weights into."""
     vae = nnx.eval_shape(lambda: VideoVae(size, dtype=dtype, rngs=nnx.Rngs(0)))
     mean, std = initial_statistics(size)
     vae.latents_mean.set_value(mean)
@@ -192,7 +178,7 @@ def abstract_vae(size: VaeSize, dtype: DTypeLike = jnp.float32) -> VideoVae:
 
 
 def initial_statistics(size: VaeSize) -> tuple[Float[Array, " c"], Float[Array, " c"]]:
-    """Mean and deviation of the latents [c]: those published with Wan2.2 at its size, else 0 and 1 until they are measured."""
+    """Mean and standard deviation of the latents [c]: Wan2.2's published ones at its size, else 0 and 1."""
     if size != VAES["wan22"]:
         return jnp.zeros(size.channels), jnp.ones(size.channels)
     published = json.loads(PUBLISHED_STATISTICS.read_text())
@@ -242,10 +228,10 @@ class Decoder(nnx.Module):
 
 
 class DownStage(nnx.Module):
-    """Residual blocks, then half the sides and perhaps half the frames; all of it beside an average without parameters.
+    """Residual blocks and downsampling, plus a shortcut that averages.
 
     Args:
-        halve_time: None leaves sides and frames as they are.
+        halve_time: whether frames are halved with the sides; None halves neither.
     """
 
     def __init__(self, i: int, o: int, blocks: int, halve_time: bool | None, layers: Layers) -> None:
@@ -254,7 +240,7 @@ class DownStage(nnx.Module):
         self.width, self.time, self.side = o, 2 if halve_time else 1, 1 if halve_time is None else 2
 
     def __call__(self, x: Float[Array, "b t h w i"], history: History) -> Float[Array, "b t2 h2 w2 o"]:
-        """Features [b t h w i] -> [b t' h' w' o], of half the sides and perhaps half the frames."""
+        """Features [b t h w i] -> [b t' h' w' o]."""
         shortcut = average_groups(x, self.width, self.time, self.side)
         for block in self.blocks:
             x = block(x, history)
@@ -262,10 +248,10 @@ class DownStage(nnx.Module):
 
 
 class UpStage(nnx.Module):
-    """Residual blocks, then double the sides and perhaps the frames, beside a repetition without parameters.
+    """Residual blocks and upsampling, plus a shortcut that repeats.
 
     Args:
-        double_time: None leaves sides and frames as they are, and there is nothing beside.
+        double_time: whether frames are doubled with the sides; None doubles neither and has no shortcut.
     """
 
     def __init__(self, i: int, o: int, blocks: int, double_time: bool | None, layers: Layers) -> None:
@@ -274,13 +260,12 @@ class UpStage(nnx.Module):
         self.width, self.time = o, 2 if double_time else 1
 
     def __call__(self, x: Float[Array, "b t h w i"], history: History) -> Float[Array, "b t2 h2 w2 o"]:
-        """Features [b t h w i] -> [b t' h' w' o], of double the sides and perhaps double the frames."""
-        before = x
+        """Features [b t h w i] -> [b t' h' w' o]."""
+        before, begins = x, history.begins
         for block in self.blocks:
             x = block(x, history)
         if self.resample is None:
             return x
-        begins = history.begins
         return self.resample(x, history) + repeat_groups(before, self.width, self.time, 2, begins)
 
 

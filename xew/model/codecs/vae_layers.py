@@ -1,7 +1,4 @@
-"""Layers of the video autoencoder: causal convolutions, norms, attention within a frame, and how sides and frames halve.
-
-Reads  activations [b t h w i], and the `History` of the chunk that they belong to
-Writes activations [b t' h' w' o]
+"""Layers of the video autoencoder: causal convolutions, norms, attention within a frame, down- and upsampling.
 
 Shape letters: b batch, t h w c video, i o channels in and out, n frames of all videos of a batch.
 """
@@ -19,12 +16,12 @@ from jaxtyping import Float
 from xew.model.codecs.vae_chunks import WINDOW, History
 
 SMALLEST_NORM = 1e-12
-"""Root of the sum of squares below which a norm does not scale up."""
+"""Least norm that `RmsNorm` divides by."""
 
 
 @dataclass(frozen=True)
 class Layers:
-    """Maker of layers that compute in one type."""
+    """Factory of layers that compute in one type."""
 
     dtype: jnp.dtype
     rngs: nnx.Rngs
@@ -34,12 +31,12 @@ class Layers:
         return Conv((WINDOW, 3, 3, i, o), self)
 
     def pointwise(self, i: int, o: int, *, zero: bool = False, axes: int = 3) -> "Conv":
-        """A convolution of single pixels."""
+        """A 1x1 convolution."""
         return Conv((1,) * axes + (i, o), self, zero=zero)
 
 
 class ResidualBlock(nnx.Module):
-    """Two causal convolutions, each after a norm, beside a shortcut: [b t h w i] -> [b t h w o]."""
+    """Residual block of two causal convolutions after norms: [b t h w i] -> [b t h w o]."""
 
     def __init__(self, i: int, o: int, layers: Layers) -> None:
         self.norm1, self.norm2 = RmsNorm(i), RmsNorm(o)
@@ -70,7 +67,7 @@ class FrameAttention(nnx.Module):
 
 
 class Downsample(nnx.Module):
-    """Half the sides by a strided convolution of each frame; half the frames, the first passed by, by one over time."""
+    """Halve the sides by a strided convolution of each frame, then the frames after the first by one over time."""
 
     def __init__(self, width: int, halve_time: bool, layers: Layers) -> None:
         self.conv = Conv((3, 3, width, width), layers)
@@ -88,7 +85,7 @@ class Downsample(nnx.Module):
 
 
 class Upsample(nnx.Module):
-    """Double the frames, the first passed by, by a convolution over time; double the sides by repeating and convolving."""
+    """Double the frames after the first by a convolution over time, then the sides by repeating and convolving."""
 
     def __init__(self, width: int, double_time: bool, layers: Layers) -> None:
         self.conv = Conv((3, 3, width, width), layers)
@@ -102,9 +99,9 @@ class Upsample(nnx.Module):
 
 
 def double_time(x: Float[Array, "b t h w c"], conv: "Conv", history: History) -> Float[Array, "b t2 h w c"]:
-    """Two frames for each by a convolution [3 1 1 c 2c]: [b t h w c] -> [b 2t h w c].
+    """Double the frames by a convolution [3 1 1 c 2c]: [b t h w c] -> [b 2t h w c].
 
-    The first frame of a video stays one, and those that follow do not see it.
+    The first frame of a video stays single and is not in the window of later frames.
     """
     first, later = (x[:, :1], x[:, 1:]) if history.begins else (x[:, :0], x)
     b, t, h, w, c = later.shape
@@ -116,7 +113,7 @@ def double_time(x: Float[Array, "b t h w c"], conv: "Conv", history: History) ->
 
 
 class RmsNorm(nnx.Module):
-    """Unit root mean square over the channels of [... c], in float32, times a learned scale."""
+    """RMS norm over the channels of [... c], in float32, times a learned scale."""
 
     def __init__(self, width: int) -> None:
         self.gamma = nnx.Param(jnp.ones(width))
@@ -139,7 +136,7 @@ class Conv(nnx.Module):
         self.bias = nnx.Param(jnp.zeros(shape[-1]))
 
     def __call__(self, x: Float[Array, "*b h w i"], history: History | None = None) -> Float[Array, "*b h w o"]:
-        """Video [b t h w i] -> [b t h w o]; a kernel over three frames asks the history for the two before."""
+        """Video [b t h w i] -> [b t h w o]; a kernel over three frames takes the two previous ones from the history."""
         if history is None:
             kernel = self.kernel[...].reshape(self.kernel.shape[-2:])
             return self.add_bias(x.astype(self.dtype) @ kernel.astype(self.dtype))
@@ -163,10 +160,9 @@ class Conv(nnx.Module):
 
 
 def _convolve_frames(x: Array, kernel: Array) -> Array:
-    """[b t+2 h w i] -> [b t h w o] by a 2-D convolution of frames that have their two predecessors in their channels.
+    """[b t+2 h w i] -> [b t h w o] by a 2-D convolution of frames with their two predecessors in the channels.
 
-    XLA hands 2-D convolutions to cuDNN channels last, as tensor cores want them, and transposes around 3-D ones. On a CPU this
-    is five times as fast as a 3-D convolution.
+    XLA passes 2-D convolutions to cuDNN channels last but transposes around 3-D ones; on a CPU 2-D is five times as fast.
     """
     i, o = kernel.shape[-2:]
     flat = jnp.moveaxis(kernel, 0, 2).reshape(3, 3, WINDOW * i, o)
@@ -174,7 +170,7 @@ def _convolve_frames(x: Array, kernel: Array) -> Array:
 
 
 def concatenate_windows(x: Float[Array, "b t h w i"], stride: int = 1) -> Float[Array, "b t2 h w c"]:
-    """Put every window of three frames side by side in the channels: [b t h w i] -> [b (t - 3) // stride + 1 h w 3i]."""
+    """Concatenate every window of three frames in the channels: [b t h w i] -> [b (t - 3) // stride + 1 h w 3i]."""
     stop = x.shape[1] - WINDOW + 1
     return jnp.concatenate([x[:, tap : tap + stop : stride] for tap in range(WINDOW)], axis=-1)
 
@@ -188,19 +184,19 @@ def _conv(x: Array, kernel: Array, strides: Sequence[int], padding: Sequence[tup
 def apply_to_frames(x: Float[Array, "b t h w i"], function: Callable[[Array], Array]) -> Float[Array, "b t h2 w2 o"]:
     """Apply a function of frames [n h w i] -> [n h' w' o] to a video [b t h w i]: [b t h' w' o]."""
     b, t = x.shape[:2]
-    made = function(x.reshape(b * t, *x.shape[2:]))
-    return made.reshape(b, t, *made.shape[1:])
+    frames = function(x.reshape(b * t, *x.shape[2:]))
+    return frames.reshape(b, t, *frames.shape[1:])
 
 
 FOLDED_ROWS = np.array([[[1, 0, 0], [0, 1, 1]], [[1, 1, 0], [0, 0, 1]]], np.float32)
-"""Rows [phase tap row] of a 3x3 kernel that meet the same pixel of a picture whose rows were repeated."""
+"""Rows [phase tap row] of a 3x3 kernel that meet the same pixel of a picture with repeated rows."""
 
 
 def double_sides(frames: Float[Array, "n h w i"], conv: Conv) -> Float[Array, "n h2 w2 o"]:
     """Repeat every pixel 2x2 times and convolve 3x3: [n h w i] -> [n 2h 2w o].
 
-    A window of three repeated pixels sees only two different ones, so each of the four phases of the output is a 2x2
-    convolution of the small frames, with the kernel's rows and columns summed: 16 products for 36, and no large input.
+    A window of three repeated pixels has only two different ones, so each of the four output phases is a 2x2 convolution of
+    the small frames with summed rows and columns of the kernel: 16 products instead of 36.
     """
     n, h, w, _ = frames.shape
     kernel = conv.kernel[...]
@@ -213,7 +209,7 @@ def double_sides(frames: Float[Array, "n h w i"], conv: Conv) -> Float[Array, "n
 
 
 def patchify(frames: Float[Array, "b t h w c"], patch: int) -> Float[Array, "b t h2 w2 features"]:
-    """Frames [b t h w c] -> patches [b t h/p w/p c*p*p]; in the channels, the column within a patch comes before the row."""
+    """Frames [b t h w c] -> patches [b t h/p w/p c*p*p]; in the channels, columns of a patch come before rows."""
     b, t, h, w, c = frames.shape
     cut = frames.reshape(b, t, h // patch, patch, w // patch, patch, c)
     return cut.transpose(0, 1, 2, 4, 6, 5, 3).reshape(b, t, h // patch, w // patch, c * patch**2)
@@ -227,9 +223,9 @@ def unpatchify(patches: Float[Array, "b t h w features"], patch: int) -> Float[A
 
 
 def average_groups(x: Float[Array, "b t h w i"], width: int, time: int, side: int) -> Float[Array, "b t2 h2 w2 {width}"]:
-    """Fold `time` frames and `side` x `side` pixels into the channels and average groups of these down to `width`.
+    """Fold `time` frames and `side` x `side` pixels into the channels, then average groups of channels down to `width`.
 
-    Frames that do not fill a fold are filled up by zeros in front: [b t h w i] -> [b ceil(t/time) h/side w/side width].
+    Missing frames are zeros in front: [b t h w i] -> [b ceil(t/time) h/side w/side width].
     """
     x = jnp.pad(x, ((0, 0), (-x.shape[1] % time, 0), (0, 0), (0, 0), (0, 0)))
     b, t, h, w, i = x.shape
@@ -242,13 +238,19 @@ def repeat_groups(
 ) -> Float[Array, "b t2 h2 w2 {width}"]:
     """Repeat channels and unfold them into `time` frames and `side` x `side` pixels of `width` channels.
 
-    At the beginning of a video the first frame becomes one: [b t h w i] -> [b t*time h*side w*side width].
+    At the beginning of a video the first frame stays single: [b t h w i] -> [b t*time h*side w*side width].
     """
     b, t, h, w, i = x.shape
     repeated = jnp.repeat(x, width * time * side**2 // i, axis=-1)
     cut = repeated.reshape(b, t, h, w, width, time, side, side).transpose(0, 1, 5, 2, 6, 3, 7, 4)
     unfolded = cut.reshape(b, t * time, h * side, w * side, width)
     return unfolded[:, time - 1 :] if begins else unfolded
+
+
+def check_frames(shape: tuple[int, ...], factor: int) -> None:
+    """Raise ValueError unless frames of this shape [b t h w 3] can be encoded by an autoencoder of this spatial factor."""
+    if len(shape) != 5 or shape[1] % 4 != 1 or shape[2] % factor or shape[3] % factor or shape[4] != 3:
+        raise ValueError(f"frames are {shape}; expected [b t h w 3] with t = 4 k + 1 and sides in {factor}s")
 
 
 def as_row(vector: Float[Array, " c"], ndim: int = 5) -> Float[Array, "... c"]:

@@ -1,6 +1,6 @@
-"""Names of the leaves of `VideoVae` in files: Wan2.2's own, diffusers', and ours.
+"""Names of the leaves of `VideoVae` in files: Wan2.2's, diffusers', and xew's.
 
-Ours is diffusers' and the two statistics of the latents, which theirs keeps in its config and Wan2.2's in its code.
+xew's files use diffusers' names and add the two statistics of the latents.
 """
 
 import re
@@ -20,7 +20,7 @@ from xew.model.weights.reading import Tensors, read_tensors
 from xew.model.weights.writing import save_weights
 
 STATISTICS = ("latents_mean", "latents_std")
-"""Leaves that only our own files hold, and diffusers' config.json."""
+"""Leaves that only xew's files and diffusers' config.json hold."""
 
 DIFFUSERS = {
     r"^(post_)?quant\.": r"\g<1>quant_conv.",
@@ -36,7 +36,7 @@ DIFFUSERS = {
     r"\.middle\.last\.": ".mid_block.resnets.1.",
     r"\.middle\.attention\.": ".mid_block.attentions.0.",
 }
-"""Patterns of our names and what diffusers writes instead, applied in order."""
+"""Patterns of xew's names and their replacements in diffusers, applied in order."""
 
 OFFICIAL = {
     r"^encoder\.stages\.(\d+)\.": r"encoder.downsamples.\1.downsamples.",
@@ -57,7 +57,7 @@ OFFICIAL = {
     r"^quant\.": "conv1.",
     r"^post_quant\.": "conv2.",
 }
-"""The same for Wan2.2; what resamples a stage is numbered on after its blocks."""
+"""The same for Wan2.2, where the resampling layer of a stage is numbered after its blocks."""
 
 
 def diffusers_layout(vae: VideoVae) -> Layout:
@@ -76,18 +76,17 @@ def official_layout(vae: VideoVae) -> Layout:
 
 
 def own_layout(vae: VideoVae) -> Layout:
-    """Names of the files that the project writes."""
+    """Names of the files that xew writes."""
     return {**diffusers_layout(vae), **{name: Source((name,)) for name in STATISTICS}}
 
 
 def load_vae(vae: VideoVae, path: Path) -> None:
-    """Fill an autoencoder from a file of any of the three kinds.
+    """Fill an autoencoder from a file in any of the three layouts.
 
-    The statistics of the latents come from the file, else from config.json beside it, as diffusers writes them; without
-    either they keep their values.
+    The statistics of the latents come from the file or from diffusers' config.json next to it, or keep their values.
 
     Raises:
-        ConfigError: the file is none of the three, or of another size, or its config.json is damaged.
+        ConfigError: the file has another layout or size, or its config.json is damaged.
     """
     tensors = read_tensors(path)
     fill(vae, tensors, _layout_of(vae, tensors), optional=STATISTICS)
@@ -98,12 +97,12 @@ def load_vae(vae: VideoVae, path: Path) -> None:
 
 
 def _read_statistic(path: Path, name: str, values: Any, channels: int) -> np.ndarray:
-    """One statistic [c] float32 of config.json beside the weights."""
+    """One statistic [c] float32 of config.json next to the weights."""
     numbers = isinstance(values, list) and all(isinstance(value, int | float) for value in values)
     array = np.asarray(values if numbers else [], np.float32)
     if len(array) != channels or not np.isfinite(array).all() or (name == "latents_std" and not (array > 0).all()):
         raise ConfigError(
-            f"{name} of config.json beside {path} is no list of {channels} finite numbers (deviations above 0); get it again."
+            f"{name} of config.json next to {path} is not a list of {channels} finite numbers (deviations > 0); get it again."
         )
     return array
 
@@ -114,15 +113,13 @@ def save_vae(vae: VideoVae, path: Path) -> None:
 
 
 def _layout_of(vae: VideoVae, tensors: Tensors) -> Layout:
-    """The layout whose first layer the file holds."""
+    """The layout of a file, by the name of its first layer."""
     known = {"encoder.conv_in.weight": own_layout, "encoder.conv1.weight": official_layout}
     for key, layout in known.items():
         if key in tensors:
             return layout(vae)
-    found = ", ".join(list(tensors)[:3]) or "nothing"
-    raise ConfigError(
-        f"{tensors.source} is no autoencoder of Wan2.2: it holds {found} …, expected {' or '.join(known)} among its tensors."
-    )
+    names = ", ".join(list(tensors)[:3]) or "nothing"
+    raise ConfigError(f"{tensors.source} is not an autoencoder of Wan2.2: it holds {names} …, expected {' or '.join(known)}.")
 
 
 def _layout(vae: VideoVae, name: Callable[[str], str]) -> Layout:
@@ -132,7 +129,7 @@ def _layout(vae: VideoVae, name: Callable[[str], str]) -> Layout:
 
 
 def _source(path: str, name: str) -> Source:
-    """PyTorch writes kernels as [out in *kernel], and the scales of norms with ones for every axis beside the channels."""
+    """PyTorch stores kernels as [out in *kernel], and scales of norms as [c 1 1] or [c 1 1 1]."""
     if path.endswith(".kernel"):
         return Source((name.removesuffix("kernel") + "weight",), "conv")
     if path.endswith(".gamma"):

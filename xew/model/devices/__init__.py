@@ -1,3 +1,3 @@
-"""Many devices and hosts: the mesh, how parameters and batches are sharded over it, and starting the processes."""
+"""Many devices and hosts: the mesh, sharding of parameters and batches, and starting the processes."""
 
 __all__ = ["sharding"]

@@ -1,8 +1,7 @@
-"""Many devices and hosts: the mesh, how parameters and batches are sharded over it, and starting the processes.
+"""Data parallel and FSDP training: the mesh, sharding of parameters and batches, and starting the processes.
 
-The mesh has two axes. Batches are sharded over both. Parameters, their moving average and the optimizer's moments are copied
-along `data` and sharded along `fsdp` (each layer's are gathered when it is computed). The numbers do not depend on the mesh,
-up to the order of sums.
+Batches are sharded over both axes of the mesh. Parameters, moving average and optimizer moments are copied along `data` and
+sharded along `fsdp`; each layer is gathered when it is computed. Results depend on the mesh only by the order of sums.
 """
 
 import functools
@@ -23,14 +22,14 @@ from xew.config import ConfigError
 AXES = ("data", "fsdp")
 """Names of the mesh's axes."""
 SMALL = 2**14
-"""Number of numbers (in one layer) below which an array is copied to every device: gathering it costs more than it weighs."""
+"""Size of an array (of one layer) below which it is copied to every device instead of sharded."""
 LAYERS = "blocks"
-"""Name below which arrays have a leading axis of layers, over which the network scans: it is never sharded."""
+"""Name of the subtree whose arrays have a leading axis of layers, which is never sharded."""
 
 
 @dataclass(frozen=True)
 class MeshSettings:
-    """How many ways the devices share the work; -1 means what the other leaves."""
+    """Sizes of the mesh's axes; -1 takes the remaining devices."""
 
     data: int = -1
     """Number of copies of the parameters, each with its shard of the batch."""
@@ -39,13 +38,13 @@ class MeshSettings:
 
 
 def start_processes(force: bool = False, environment: Mapping[str, str] = os.environ) -> None:
-    """Join the other processes of this run, if a launcher has started several.
+    """Join the other processes of this run if `force` is true or a launcher has started several.
 
-    It does so when asked, or when the variables of a launcher are set: JAX_COORDINATOR_ADDRESS with JAX_NUM_PROCESSES and
-    JAX_PROCESS_ID (one pair for each process), or those of Slurm or Open MPI with more than one task, which JAX reads itself.
+    A launcher sets JAX_COORDINATOR_ADDRESS, JAX_NUM_PROCESSES and JAX_PROCESS_ID, or Slurm's or Open MPI's variables for more
+    than one task.
 
     Raises:
-        ConfigError: the variables contradict each other, or the others were not found.
+        ConfigError: the variables contradict each other, or the other processes cannot be reached.
     """
     tasks = max(int(environment.get(name, 1)) for name in ("SLURM_STEP_NUM_TASKS", "OMPI_COMM_WORLD_SIZE"))
     coordinator = environment.get("JAX_COORDINATOR_ADDRESS")
@@ -63,31 +62,27 @@ def start_processes(force: bool = False, environment: Mapping[str, str] = os.env
 
 
 def mesh_shape(settings: MeshSettings, devices: int) -> tuple[int, int]:
-    """Sizes of the axes data and fsdp on a number of devices. Raises ConfigError if they do not fill them exactly."""
-    asked = (settings.data, settings.fsdp)
-    known = math.prod(size for size in asked if size != -1)
-    if asked.count(-1) > 1 or min(asked) < -1 or 0 in asked:
-        raise ConfigError(
-            f"mesh is data {asked[0]} x fsdp {asked[1]}; give positive numbers, at most one of them -1 (the rest)."
-        )
-    if devices % known or (-1 not in asked and known != devices):
-        raise ConfigError(
-            f"mesh is data {asked[0]} x fsdp {asked[1]}, there are {devices} devices; the product must be {devices} "
-            "(-1 takes what the other leaves)."
-        )
-    data, fsdp = (size if size != -1 else devices // known for size in asked)
+    """Sizes of the axes data and fsdp on this many devices. Raises ConfigError unless they use all devices."""
+    sizes = (settings.data, settings.fsdp)
+    known = math.prod(size for size in sizes if size != -1)
+    mesh = f"mesh is data {settings.data} x fsdp {settings.fsdp}"
+    if sizes.count(-1) > 1 or min(sizes) < -1 or 0 in sizes:
+        raise ConfigError(f"{mesh}; expected positive numbers, or -1 for one of them (the remaining devices).")
+    if devices % known or (-1 not in sizes and known != devices):
+        raise ConfigError(f"{mesh}, there are {devices} devices; the product must be {devices} (-1 takes the rest).")
+    data, fsdp = (size if size != -1 else devices // known for size in sizes)
     return data, fsdp
 
 
 def make_mesh(settings: MeshSettings, devices: Sequence[jax.Device] | None = None) -> Mesh:
-    """The mesh over all devices of all processes, or over the given ones."""
+    """The mesh over the given devices, by default all devices of all processes."""
     devices = jax.devices() if devices is None else devices
     shape = mesh_shape(settings, len(devices))
     return jax.make_mesh(shape, AXES, axis_types=(AxisType.Auto,) * 2, devices=devices)
 
 
 def check_batch(batch: int, accumulate: int, devices: int) -> None:
-    """Raise ConfigError unless every device gets equally many samples of each of the `accumulate` parts of the batch."""
+    """Raise ConfigError unless each of the `accumulate` parts of the batch divides evenly over the devices."""
     if batch % (devices * accumulate):
         near = max(1, round(batch / (devices * accumulate))) * devices * accumulate
         raise ConfigError(
@@ -97,7 +92,7 @@ def check_batch(batch: int, accumulate: int, devices: int) -> None:
 
 
 def parameter_spec(path: Sequence[Any], shape: Sequence[int], fsdp: int) -> PartitionSpec:
-    """Axis of an array that is sharded: the largest that `fsdp` divides (the last of equals), but no axis of layers."""
+    """Sharding of an array: its largest axis that `fsdp` divides (the last of equals), but not the axis of layers."""
     first = 1 if LAYERS in path and len(shape) > 1 else 0
     candidates = [axis for axis in range(first, len(shape)) if shape[axis] % fsdp == 0]
     if fsdp == 1 or not candidates or math.prod(shape[first:]) < SMALL:
@@ -107,7 +102,7 @@ def parameter_spec(path: Sequence[Any], shape: Sequence[int], fsdp: int) -> Part
 
 
 def place_shapes(shapes: Any, mesh: Mesh | AbstractMesh) -> Any:
-    """Give a tree of shapes and types (parameters, optimizer) their places on the mesh; only shapes and names are looked at."""
+    """Add shardings on the mesh to a tree of shapes and types (parameters, optimizer)."""
 
     def place(path: tuple[Any, ...], leaf: Any) -> jax.ShapeDtypeStruct:
         spec = parameter_spec(path_names(path), leaf.shape, mesh.shape["fsdp"])
@@ -117,7 +112,7 @@ def place_shapes(shapes: Any, mesh: Mesh | AbstractMesh) -> Any:
 
 
 def place_like(shapes: Any, like: Any) -> Any:
-    """Give a tree of shapes and types their places on the mesh of another tree, or on its device."""
+    """Add shardings to a tree of shapes and types, on the mesh or device of another tree."""
     sharding = jax.tree.leaves(like)[0].sharding
     if isinstance(sharding, NamedSharding) and isinstance(sharding.mesh, Mesh):
         return place_shapes(shapes, sharding.mesh)
@@ -125,9 +120,9 @@ def place_like(shapes: Any, like: Any) -> Any:
 
 
 def path_names(path: Sequence[Any]) -> tuple[str, ...]:
-    """The plain names along a path in a tree, such as (blocks, self_attn, q, kernel)."""
+    """The names along a path in a tree, such as (blocks, self_attn, q, kernel)."""
     names = [str(getattr(entry, "key", getattr(entry, "name", getattr(entry, "idx", entry)))) for entry in path]
-    return tuple(names[:-1] if names and names[-1] == "value" else names)  # NNX ends a parameter's path so
+    return tuple(names[:-1] if names and names[-1] == "value" else names)  # NNX appends "value"
 
 
 def batch_sharding(mesh: Mesh) -> NamedSharding:
@@ -136,26 +131,26 @@ def batch_sharding(mesh: Mesh) -> NamedSharding:
 
 
 def replicated_sharding(mesh: Mesh) -> NamedSharding:
-    """Sharding of an array that every device has a copy of."""
+    """Sharding of an array that is copied to every device."""
     return NamedSharding(mesh, PartitionSpec())
 
 
 def process_samples(mesh: Mesh, batch: int) -> Int[np.ndarray, " n"]:
-    """Indices [n] of the samples of the whole batch that this process loads, in order."""
+    """Sorted indices [n] of the samples of a batch that this process loads."""
     slices = batch_sharding(mesh).addressable_devices_indices_map((batch,)).values()
     return np.unique(np.concatenate([np.arange(batch)[index] for index in slices]))
 
 
 def place_batch(batch: Any, mesh: Mesh) -> Any:
-    """Put this process's samples, any tree of arrays [b' ...], on the mesh as its shard of the whole batch [b ...]."""
+    """Place this process's samples, a tree of arrays [b' ...], on the mesh as its part of the batch [b ...]."""
     sharding = batch_sharding(mesh)
     return jax.tree.map(lambda leaf: jax.make_array_from_process_local_data(sharding, leaf), batch)
 
 
 def shard_over_batch(values: Shaped[Array, "b ..."]) -> Shaped[Array, "b ..."]:
-    """Tell the compiler that activations [b ...] stay sharded over the batch alone, where a mesh is set.
+    """Constrain activations [b ...] to be sharded over the batch alone, if a mesh is set.
 
-    Left to itself it may shard their features where it has sharded the parameters', which cuDNN's attention cannot take.
+    The compiler may otherwise shard their features, which cuDNN's attention does not support.
     """
     mesh = jax.sharding.get_abstract_mesh()
     axes = tuple(axis for axis in AXES if axis in mesh.axis_names)
@@ -166,12 +161,11 @@ def shard_over_batch(values: Shaped[Array, "b ..."]) -> Shaped[Array, "b ..."]:
 def gather_parameters(parameters: Any, *, layer: bool = False) -> Any:
     """Gather parameters that are sharded along `fsdp` on every device; their gradients are summed and sharded again.
 
-    Left to itself the compiler moves activations instead wherever they are the smaller, many times a layer. Nothing is done
-    where no mesh is set or it does not shard.
+    The compiler may otherwise move activations, many times a layer. Without `fsdp` the parameters are returned unchanged.
 
     Args:
-        parameters: any tree of arrays.
-        layer: they are those of one layer, without the axis of layers; else all, of which the layers are left as they are.
+        parameters: tree of arrays.
+        layer: whether they are one layer's, without the axis of layers; otherwise all, and the layers are left sharded.
     """
     fsdp = dict(jax.sharding.get_abstract_mesh().shape).get("fsdp", 1)
     if fsdp == 1:

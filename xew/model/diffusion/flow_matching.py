@@ -1,7 +1,7 @@
-"""Flow matching: noise levels, the training pair and the RGB loss; samplers.py integrates what the network learns.
+"""Flow matching: noise levels, the training pair and the RGB loss; samplers.py integrates the velocity.
 
-x_sigma = (1 - sigma) x_0 + sigma n; the network predicts the velocity n - x_0. Latent frame 0 is the given reference:
-clean in training but for a small perturbation, put back after every sampling step, and never in the loss.
+x_sigma = (1 - sigma) x_0 + sigma n; the network predicts the velocity n - x_0. Latent frame 0 is the given reference: slightly
+perturbed in training, restored after every sampling step, and never in the loss.
 """
 
 from typing import NamedTuple
@@ -15,37 +15,34 @@ from jaxtyping import Float, Key, Num
 TRAIN_LEVELS = 1000
 """Number of noise levels that training draws from."""
 REFERENCE_NOISE = 0.1
-"""Largest standard deviation of the noise that perturbs the reference latent in training; it is drawn uniformly (FlowWAM)."""
+"""Largest standard deviation of the noise on the reference latent in training; it is drawn uniformly (FlowWAM)."""
 GUESS_SPREAD = 0.7
-"""Standard deviation of latents round the guess that a prediction of residuals begins with. Of standardized latents of 18
-episodes it is .67 round the pasted render and 1.0 round the first frame."""
+"""Standard deviation of clean latents around the guess of a residual; measured 0.67 around the pasted render."""
 
 
 class TrainingPair(NamedTuple):
-    """What one training example asks of the network."""
+    """Input and target of the network for a batch."""
 
     noisy: Float[Array, "b t h w c"]
     """Noisy latents [b t h w c] float32, whose latent frame 0 is the perturbed reference."""
     velocity: Float[Array, "b t h w c"]
     """Target [b t h w c] float32."""
     sigma: Float[Array, " b"]
-    """Noise level [b] float32 of latent frames 1 and on."""
+    """Noise level [b] float32 of latent frames from 1 on."""
 
 
 def put_first(latents: Float[Array, "b t h w c"], reference: Float[Array, "b 1 h w c"]) -> Float[Array, "b t h w c"]:
-    """Latents [b t h w c] whose first frame is replaced by the given one [b 1 h w c]."""
+    """Replace the first frame of latents [b t h w c] by the given one [b 1 h w c]."""
     return jnp.concatenate([reference, latents[:, 1:]], axis=1)
 
 
 def training_pair(key: Key[Array, ""], latents: Float[Array, "b t h w c"], shift: float) -> TrainingPair:
-    """Noisy latents and their velocity, at a level drawn for each sample.
-
-    The reference, latent frame 0, is perturbed.
+    """Noisy latents with a perturbed reference, and their velocity, at a random level for each sample.
 
     Args:
         key: of the random numbers.
         latents: [b t h w c] float32, clean.
-        shift: moves the `TRAIN_LEVELS` levels, which are drawn uniformly, toward noise.
+        shift: of the `TRAIN_LEVELS` levels, which are drawn uniformly, toward noise.
     """
     key_level, key_noise, key_strength, key_reference = jax.random.split(key, 4)
     batch = latents.shape[0]
@@ -60,11 +57,8 @@ def training_pair(key: Key[Array, ""], latents: Float[Array, "b t h w c"], shift
 
 
 def motion_weights(latents: Float[Array, "b t h w c"], strength: float) -> Float[Array, "b t h w"]:
-    """Weights [b t h w] of places in the loss: a moving place weighs up to 1 + `strength` times a still one; mean 1.
-
-    Args:
-        latents: [b t h w c], clean and of variance 1; a place moves as far as it differs from the first frame.
-        strength: 0 weighs all places alike.
+    """Weights [b t h w] of positions in the loss, of mean 1: up to 1 + `strength` where clean latents [b t h w c] differ from
+    the first frame, relative to positions that do not.
     """
     change = jnp.square(latents - latents[:, :1]).mean(axis=-1)
     weights = 1 + strength * change / (change + GUESS_SPREAD**2)
@@ -77,19 +71,16 @@ def sample_losses(
     valid: Num[Array, "b t"] | None = None,
     weights: Float[Array, "b t h w"] | None = None,
 ) -> Float[Array, " b"]:
-    """Mean squared error of the velocity of each sample, over latent frames 1 and on.
+    """Mean squared error [b] float32 of the velocity of each sample, over latent frames from 1 on; 0 if no frame is valid.
 
     Args:
         predicted: [b t h w c] float32, velocity.
-        pair: what it was predicted for.
-        valid: [b t] float32, 1 for latent frames that show the episode and 0 past its end; all count if left out.
-        weights: [b t h w] of places, as from `motion_weights`; all weigh alike if left out.
-
-    Returns:
-        [b] float32; 0 where no frame counts.
+        pair: input and target.
+        valid: [b t] float32, 1 for latent frames of the episode and 0 past its end; by default all 1.
+        weights: [b t h w] of positions, as from `motion_weights`; by default all 1.
     """
-    places = jnp.square(predicted[:, 1:] - pair.velocity[:, 1:]).mean(axis=4)
-    errors = (places if weights is None else weights[:, 1:] * places).mean(axis=(2, 3))
+    squares = jnp.square(predicted[:, 1:] - pair.velocity[:, 1:]).mean(axis=4)
+    errors = (squares if weights is None else weights[:, 1:] * squares).mean(axis=(2, 3))
     if valid is None:
         return errors.mean(axis=1)
     return (errors * valid[:, 1:]).sum(axis=1) / jnp.maximum(valid[:, 1:].sum(axis=1), 1)
@@ -101,7 +92,7 @@ def sampling_sigmas(steps: int, shift: float) -> Float[np.ndarray, " levels"]:
 
 
 def shift_sigma(sigma: Float[np.ndarray, "*n"], shift: float) -> Float[np.ndarray, "*n"]:
-    """Noise levels [...] float64 moved toward 1: s u / (1 + (s - 1) u)."""
+    """Shift noise levels [...] float64 toward 1: s u / (1 + (s - 1) u)."""
     return shift * sigma / (1 + (shift - 1) * sigma)
 
 
@@ -111,18 +102,17 @@ def velocity_of_residual(
     sigma: Float[Array, " b"],
     guess: Float[Array, "b k h w c"],
 ) -> Float[Array, "b t h w c"]:
-    """Velocity [b t h w c] of what is left of clean latents behind their best linear estimate.
+    """Velocity [b t h w c] from the residual of the best linear estimate of the clean latents.
 
-    The estimate is the best linear one of latents that are normally distributed round a guess, with the standard deviation
-    `GUESS_SPREAD`, from noisy ones. A residual of 0 is that estimate (at level 1 the guess itself), and of such latents it
-    has the variance 1 at every level: the preconditioning of Karras et al. 2022 (arXiv 2206.00364, section 5), for flow
-    matching and with a mean.
+    The estimate assumes latents normally distributed around a guess with the standard deviation `GUESS_SPREAD`; the residual
+    then has variance 1 at every level. This is the preconditioning of Karras et al. 2022 (arXiv 2206.00364, section 5) for
+    flow matching with a mean.
 
     Args:
-        residual: [b t h w c] what the network computes.
+        residual: [b t h w c] output of the network.
         noisy: [b t h w c] noisy latents.
         sigma: [b] their noise levels.
-        guess: [b k h w c] with k = t, or k = 1 where it stands still.
+        guess: [b k h w c] with k = t, or k = 1 for a still guess.
     """
     level, variance = sigma[:, None, None, None, None], GUESS_SPREAD**2
     seen = (1 - level) ** 2 * variance + level**2

@@ -5,8 +5,8 @@ Writes latents whose frame 0 is the reference
 To add a schedule: a function (steps, shift) -> NoiseSchedule and one line in SCHEDULES. To add a sampler: a function as
 `euler` and one line in SAMPLERS.
 
-Four schedules are in circulation for "Wan2.2, shift 5". They differ in the third digit, and results compare only under the
-same one, so a schedule is chosen by name (the config calls it `rollout.grid`).
+Published code has four schedules for "Wan2.2, shift 5", which differ in the third digit. Compare results only under the same
+schedule.
 """
 
 from collections.abc import Callable
@@ -21,23 +21,22 @@ from jaxtyping import Float
 from xew.model.diffusion.flow_matching import TRAIN_LEVELS, put_first, sampling_sigmas, shift_sigma
 
 Velocity = Callable[[Array, Array], Array]
-"""Function (latents [b t h w c], noise level that the network gets as input [b]) -> velocity [b t h w c], all float32."""
+"""Function (latents [b t h w c], the network's input level [b]) -> velocity [b t h w c], all float32."""
 Schedule = Callable[[int, float], "NoiseSchedule"]
 """Function (steps, shift) -> noise schedule."""
 _Carry = tuple[Array, Array, Array, Array]
 NEARLY_ONE = 1 - 1e-6
-"""Highest noise level that UniPC computes with: pure noise has no logarithm of a signal-to-noise ratio. As in diffusers."""
+"""Highest noise level in UniPC, as in diffusers: the log signal-to-noise ratio of pure noise is infinite."""
 
 
 @dataclass(frozen=True)
 class NoiseSchedule:
-    """Noise levels that a sampler goes through; hashable, so that a compiled function can take it as static."""
+    """Noise levels of a sampler; hashable, for use as a static argument."""
 
     sigmas: tuple[float, ...]
     """Decreasing levels, `steps` + 1 of them, the last 0."""
     input_levels: tuple[float, ...]
-    """Levels that the network gets as input, `steps` of them: some projects cut their timesteps (level times 1000) to whole
-    numbers."""
+    """The network's input levels, `steps` of them; some projects truncate timesteps (level times 1000) to integers."""
 
     @property
     def steps(self) -> int:
@@ -52,16 +51,13 @@ def flowwam(steps: int, shift: float) -> NoiseSchedule:
 
 
 def wan_official(steps: int, shift: float) -> NoiseSchedule:
-    """The schedule of Wan's repository (`fm_solvers_unipc.py`): from 0.999, evenly spaced before the shift, timesteps whole."""
+    """The schedule of Wan's repository (`fm_solvers_unipc.py`): from 0.999, even before the shift, integer timesteps."""
     sigmas = shift_sigma(np.linspace(1 - 1 / TRAIN_LEVELS, 0, steps + 1), shift)
     return _make_schedule(sigmas, np.floor(sigmas[:-1] * TRAIN_LEVELS) / TRAIN_LEVELS)
 
 
 def diffusers_unipc(steps: int, shift: float) -> NoiseSchedule:
-    """The schedule of diffusers' `UniPCMultistepScheduler` with flow sigmas.
-
-    The levels go from 1 to 0.001 before the shift, the last left out; timesteps are whole.
-    """
+    """The schedule of diffusers' `UniPCMultistepScheduler` with flow sigmas: from 1 to before 0.001, integer timesteps."""
     sigmas = shift_sigma(np.linspace(1, 1 / TRAIN_LEVELS, steps + 1)[:-1], shift)
     sigmas[0] = min(sigmas[0], NEARLY_ONE)
     return _make_schedule(np.append(sigmas, 0), np.floor(sigmas * TRAIN_LEVELS) / TRAIN_LEVELS)
@@ -88,16 +84,13 @@ def euler(
     noise: Float[Array, "b t h w c"],
     schedule: NoiseSchedule,
 ) -> Float[Array, "b t h w c"]:
-    """Integrate the velocity by straight steps.
+    """Integrate the velocity by Euler steps: latents [b t h w c] float32 whose frame 0 is the reference.
 
     Args:
         velocity: see `Velocity`.
-        reference: [b 1 h w c] float32, clean latent frame 0; put back after every step.
+        reference: [b 1 h w c] float32, clean latent frame 0, restored after every step.
         noise: [b t h w c] float32, unit normal; its frame 0 is not used.
         schedule: see `SCHEDULES`.
-
-    Returns:
-        [b t h w c] float32 whose frame 0 is the reference.
     """
 
     def step(latents: Array, levels: tuple[Array, Array]) -> tuple[Array, None]:
@@ -115,13 +108,10 @@ def unipc(
     noise: Float[Array, "b t h w c"],
     schedule: NoiseSchedule,
 ) -> Float[Array, "b t h w c"]:
-    """Integrate the velocity by UniPC (Zhao et al., arXiv 2302.04867).
+    """Integrate the velocity by UniPC (Zhao et al., arXiv 2302.04867): arguments and result [b t h w c] as of `euler`.
 
-    It is of order 2, predicts data, and is the variant B2; its first and last step are of order 1. Each evaluation first
-    corrects the latents that it was made at, then predicts the next. All coefficients follow from the schedule alone, so a
-    step is two weighted sums.
-
-    It takes and gives the same as `euler`: latents [b t h w c] float32.
+    Order 2, data prediction, variant B2; the first and last step have order 1. Each evaluation corrects the current latents,
+    then predicts the next. All coefficients depend on the schedule alone, so a step is two weighted sums.
     """
 
     def step(carry: _Carry, weights: tuple[Array, ...]) -> tuple[_Carry, None]:
@@ -144,16 +134,12 @@ SAMPLERS = {"euler": euler, "unipc": unipc}
 
 
 def predictor_weights(sigmas: tuple[float, ...]) -> Float[np.ndarray, "steps 3"]:
-    """UniP's weights [steps 3] float64 of the corrected latents, of the data predicted here and of those a step before."""
+    """UniP's weights [steps 3] float64 of the corrected latents, and of the data predicted here and one step before."""
     return np.array([_predictor(sigmas, step) for step in range(len(sigmas) - 1)])
 
 
 def corrector_weights(sigmas: tuple[float, ...]) -> Float[np.ndarray, "steps 5"]:
-    """UniC's weights [steps 5] float64.
-
-    They are those of the latents, the corrected latents a step before, and the data predicted here, one and two steps
-    before. Nothing precedes the first step, which keeps its latents.
-    """
+    """UniC's weights [steps 5] float64 of the latents, the previous corrected latents, and the data of the last three steps."""
     keep = (1.0, 0.0, 0.0, 0.0, 0.0)
     return np.array([keep, *(_corrector(sigmas, step) for step in range(1, len(sigmas) - 1))])
 
@@ -168,7 +154,7 @@ def _predictor(sigmas: tuple[float, ...], step: int) -> tuple[float, float, floa
 
 
 def _corrector(sigmas: tuple[float, ...], step: int) -> tuple[float, float, float, float, float]:
-    """The interval that led here, taken again with the data predicted at its end."""
+    """Weights that repeat the previous interval with the data predicted at its end."""
     interval = _interval(sigmas, step - 1)
     if _order(sigmas, step - 1) == 1:
         return 0.0, interval.decay, 0.5 * interval.gain, 0.5 * interval.gain, 0.0
@@ -183,14 +169,14 @@ def _corrector(sigmas: tuple[float, ...], step: int) -> tuple[float, float, floa
 
 @dataclass(frozen=True)
 class _Interval:
-    """What an exact exponential step from one level to the next does when the predicted data stay what they are."""
+    """An exact exponential step between two levels for constant data."""
 
     length: float
     """Difference in log signal-to-noise; infinite for the last step."""
     decay: float
     """Weight of the latents."""
     phi: float
-    """Value of exp(-length) - 1."""
+    """exp(-length) - 1."""
     gain: float
     """Weight of the data."""
 
@@ -208,12 +194,12 @@ def _log_snr(sigma: float) -> float:
 
 
 def _ratio(sigmas: tuple[float, ...], step: int, interval: _Interval) -> float:
-    """Place of the level before, in lengths of this interval (negative)."""
+    """Position of the previous level relative to this interval's length (negative)."""
     return (_log_snr(sigmas[step - 1]) - _log_snr(sigmas[step])) / interval.length
 
 
 def _order(sigmas: tuple[float, ...], step: int) -> int:
-    """Order of a step: 2 but for the first, which has no past, and the last."""
+    """Order of a step: 1 for the first and last, otherwise 2."""
     return 1 if step in (0, len(sigmas) - 2) else 2
 
 

@@ -1,6 +1,6 @@
-"""Which episodes of a data set an experiment reads: to learn from, to replay, to draw samples of, to predict.
+"""Episodes of an experiment: for training, replay, sample videos and rollouts, and their commands.
 
-Each choice is made here once, from one index of the data set, and everything behind takes the episodes themselves.
+`choice.py` selects them from the index of a data set; other packages take the episodes themselves.
 """
 
 __all__ = ["choice", "commands"]

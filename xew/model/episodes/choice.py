@@ -1,4 +1,4 @@
-"""Choosing the episodes of a data set that a training run, its samples or a rollout read."""
+"""Selection of the episodes of a training run, its sample videos and rollouts."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,53 +13,48 @@ from xew.protocol import expand_robots
 
 @dataclass(frozen=True)
 class TrainingEpisodes:
-    """The episodes that a training run reads."""
+    """The episodes of a training run."""
 
     fresh: list[Episode]
-    """Those to learn from."""
+    """Training episodes."""
     replay: list[Episode]
-    """Those of the run that an adaptation starts from, of which every batch has a part."""
+    """Replayed training episodes of the run that an adaptation starts from."""
     samples: dict[str, Episode]
-    """Those that sample videos are drawn of, by role and robot."""
+    """Episodes of sample videos, by role and robot."""
 
 
 def choose_episodes(dataset: Dataset, choice: EpisodeChoice) -> TrainingEpisodes:
-    """Choose all episodes that a training run reads.
+    """Choose all episodes of a training run.
 
     Raises:
-        ConfigError, EpisodeError: there are none to learn from, too few to adapt to, or no videos to draw samples of.
+        ConfigError, EpisodeError: there are no or too few training episodes, or an episode of a sample has no video.
     """
     samples = sample_episodes(dataset, choice.samples, choice.motion)
     bare = [folder for folder, record in samples.values() if not record.videos]
     if bare:
         raise ConfigError(
-            f"{bare[0]} was made with --states-only and has no video to begin a sample with; draw none with "
+            f"{bare[0]} was made with --states-only and has no video for samples; disable samples with "
             f"--train.sample-every 0, or make videos: python -m xew.sim_warp.inspect {dataset.root} --render"
         )
     return TrainingEpisodes(training_episodes(dataset, choice), replay_episodes(dataset, choice), samples)
 
 
 def training_episodes(dataset: Dataset, choice: EpisodeChoice) -> list[Episode]:
-    """Episodes to learn from, of training seeds: all of the training robots, or a few of the robots to adapt to.
+    """Training episodes of the training robots, or the first few (`shots`) of the robots to adapt to.
 
     Raises:
-        ConfigError, EpisodeError: there are none, or too few to adapt to.
+        ConfigError: there are none or, in an adaptation, too few of a robot.
+        EpisodeError: some have another kind of motion.
     """
     return _select_training(dataset, choice.robots, choice.motion, shots=choice.shots, need_all=choice.shots > 0)
 
 
 def replay_episodes(dataset: Dataset, choice: EpisodeChoice) -> list[Episode]:
-    """In an adaptation with replay, what the run that it starts from was trained on; else none."""
+    """Replayed episodes of an adaptation: training episodes of the run that it starts from. Raises as `training_episodes`."""
     return _select_training(dataset, choice.replay, choice.motion, need_all=True) if choice.replay else []
 
 
 def _select_training(dataset: Dataset, robots: Sequence[str], motion: str, *, shots: int = 0, need_all: bool) -> list[Episode]:
-    """Episodes of training seeds of some robots, all or the first few of each task and robot.
-
-    Raises:
-        ConfigError: a robot has none (one of all, unless all are needed), or fewer than those few.
-        EpisodeError: some are of another kind of motion.
-    """
     chosen = dataset.select(robots=robots, split="train", motion=motion)
     if shots:
         chosen = first_of_each(chosen, shots)
@@ -70,7 +65,7 @@ def _select_training(dataset: Dataset, robots: Sequence[str], motion: str, *, sh
 
 
 def first_of_each(episodes: Sequence[Episode], count: int) -> list[Episode]:
-    """The first `count` seeds of every task and robot. Raises ConfigError where there are fewer."""
+    """The first `count` seeds of every task and robot. Raises ConfigError if there are fewer."""
     groups: dict[tuple[str, str], list[Episode]] = {}
     for episode in sorted(episodes, key=lambda episode: episode[1].seed):
         groups.setdefault((episode[1].task, episode[1].robot), []).append(episode)
@@ -78,16 +73,13 @@ def first_of_each(episodes: Sequence[Episode], count: int) -> list[Episode]:
         if len(group) < count:
             raise ConfigError(
                 f"adapt.episodes is {count}, there are only {len(group)} training episodes of {robot} in {task}; lower it, or "
-                "make more with `python -m xew.sim_warp.generate`."
+                "make more episodes with `python -m xew.sim_warp.generate`."
             )
     return [episode for _, group in sorted(groups.items()) for episode in group[:count]]
 
 
 def sample_episodes(dataset: Dataset, roles: Mapping[str, str], motion: str | None = None) -> dict[str, Episode]:
-    """An episode of each of these robots that the data has, by role and robot, never of a test seed.
-
-    It is of a validation seed where there is one of that robot, else of a training seed, which a model of the robot has seen.
-    """
+    """An episode of each of these robots in the data, by role and robot: of a validation seed, else of a training seed."""
     robots = tuple(roles)
     candidates = [e for family in ("validation", "train") for e in dataset.select(robots=robots, split=family, motion=motion)]
     first = {record.robot: (folder, record) for folder, record in reversed(candidates)}
@@ -95,10 +87,10 @@ def sample_episodes(dataset: Dataset, roles: Mapping[str, str], motion: str | No
 
 
 def select_episodes(data: Path, split: str, robots: Sequence[str] | None = None) -> list[Episode]:
-    """Accepted episodes of a seed family and of the given robots, or of all.
+    """Accepted episodes of a seed family and of the given robots, by default all.
 
     Raises:
-        ConfigError, EpisodeError: there is none, or they are of both kinds of motion.
+        ConfigError, EpisodeError: there are none, or they have both kinds of motion.
     """
     dataset = read_dataset(data)
     robots = expand_robots(robots or ()) or None
@@ -115,10 +107,10 @@ def select_episodes(data: Path, split: str, robots: Sequence[str] | None = None)
 
 
 def explain_missing_robots(dataset: Dataset, robots: Sequence[str], what: str = "episode") -> ConfigError:
-    """The error for robots of which there is no such episode: it says which robots there are, and how to make some."""
-    known, asked = sorted({record.robot for _, record in dataset.cells}), ", ".join(robots[:6])
+    """The error for robots without such an episode, with the robots of the data and the command that makes episodes."""
+    known, missing = sorted({record.robot for _, record in dataset.cells}), ", ".join(robots[:6])
     return ConfigError(
-        f"{dataset.root} has no {what} of {asked}{' …' if len(robots) > 6 else ''};{suggestion(robots[0], known)} it has "
+        f"{dataset.root} has no {what} of {missing}{' …' if len(robots) > 6 else ''};{suggestion(robots[0], known)} it has "
         f"{', '.join(known) or 'nothing'}. Make some: python -m xew.sim_warp.generate --robots {' '.join(robots[:6])} "
         f"--out {dataset.root}"
     )

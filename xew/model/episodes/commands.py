@@ -1,4 +1,4 @@
-"""The commands of an episode, from which conditions are made before anything of it has happened."""
+"""Reading the commands of an episode, the input of conditions."""
 
 from pathlib import Path
 
@@ -11,10 +11,12 @@ from xew.model.conditions import Command, make_command
 def episode_command(
     folder: Path, record: Record, rendered: np.ndarray | None = None, scene: np.ndarray | None = None
 ) -> Command:
-    """Read what conditions may be made from, of an episode of a data set.
+    """Read the command of an episode.
 
     Args:
-        rendered: [t 240 320 3] uint8, the robot alone, where it is in memory; else its video is read when it is needed.
-        scene: [t 240 320 3] uint8, the episode's video, where it is in memory; conditions see its first frame alone.
+        folder: of the episode.
+        record: of the episode.
+        rendered: [t 240 320 3] uint8, the robot alone, if in memory; otherwise its video is read when needed.
+        scene: [t 240 320 3] uint8, the episode's video, if in memory; conditions see its first frame alone.
     """
     return make_command(folder, record, read_states(folder), rendered, scene)

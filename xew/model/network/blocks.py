@@ -1,12 +1,8 @@
-"""One block of the network and what it is made of: attention, norms, feed-forward, and how they are computed on a device.
+"""One block of the network: attention, norms, feed-forward, and their implementation on a device.
 
-Reads  tokens [b s d] of all streams, modulations [b r 6 d], rotations, context [b l d]
-Writes tokens [b s d]
+Shape letters: as in dit.py. Modules and parameters have the names of Wan's checkpoints.
 
-Shape letters: as in dit.py. Names of modules and parameters are those of Wan's checkpoints where Wan has the thing.
-
-Precision: matrix products and attention in `dtype`; norms, modulation and residual sums in float32 and written so that they
-fuse: no [b s 6 d] is formed, and what enters several products is rounded once.
+Precision: matrix products and attention in `dtype`; norms, modulation and residual sums in float32, without forming [b s 6 d].
 """
 
 import functools
@@ -28,7 +24,7 @@ from xew.model.network.mechanisms import FramedContext, linear
 from xew.model.network.tokens import WAN_PATCH, WAVELENGTH_BASE, Patch
 
 EPSILON = 1e-6
-"""Added to the variance in every norm."""
+"""Term added to the variance in every norm."""
 
 Activation = Callable[[Array], Array]
 Rotary = tuple[Float[Array, "s angles"], Float[Array, "s angles"]]
@@ -39,17 +35,16 @@ RematName = Literal["none", "attention", "dots", "full"]
 
 
 class ConditionCache(NamedTuple):
-    """What every layer's RGB tokens read of the condition tokens, where these do not look back (`one_way`)."""
+    """Keys (rotated) and values of the condition tokens of a `one_way` model, for the RGB tokens of every layer."""
 
     keys: Float[Array, "*layers b s heads k"]
-    """Rotated keys [layers b s n head_dim]; of one layer [b s n head_dim]."""
+    """[layers b s n head_dim]; of one layer [b s n head_dim]."""
     values: Float[Array, "*layers b s heads k"]
-    """Values of the same shape."""
 
 
 @dataclass(frozen=True)
 class ModelSize:
-    """Everything that distinguishes one size of the network from another."""
+    """Hyperparameters of the network."""
 
     dim: int
     """Width of a token."""
@@ -59,16 +54,15 @@ class ModelSize:
     ffn_dim: int
     """Width of the hidden layer of the feed-forward."""
     text_dim: int
-    """Width of the text's embeddings."""
+    """Width of the text embeddings."""
     text_tokens: int
-    """Number of tokens that the text is padded to."""
+    """Number of tokens to which the text is padded."""
     rotary_base: float = WAVELENGTH_BASE
-    """Ratio of the slowest to the fastest rotation of positions; Wan's serves clips of hundreds of positions a side, and
-    a model of few positions resolves them sooner with less."""
+    """Base of the wavelengths of rotary positions; with few positions a model learns sooner with a smaller base."""
     epsilon: float = EPSILON
-    """Number that all norms add to a mean square; Wan's, but for checkpoints whose config.json says otherwise."""
+    """Term that all norms add to a mean square."""
     patch: Patch = WAN_PATCH
-    """Latent frames (always one), rows and columns of a token: smaller ones make finer pictures of more tokens."""
+    """Latent frames (always one), rows and columns of a token."""
 
     @property
     def head_dim(self) -> int:
@@ -97,38 +91,35 @@ class Block(nnx.Module):
         condition_start: int | None = None,
         cache: ConditionCache | None = None,
     ) -> Float[Array, "b s d"]:
-        """One block's change of the tokens.
+        """Tokens [b s d] after the block.
 
         Args:
             tokens: [b s d].
             modulation: [b r 6 d] float32, one for each noise level.
-            levels: [s], which of them each token takes.
+            levels: [s], index of each token's level.
             rotary: rotations of the tokens' positions.
-            text: [b l d], what cross-attention reads.
-            condition_start: tokens from here on see none before them; those before see all. All see all if left out.
-            cache: keys and values that the tokens before `condition_start` see too.
-
-        Returns:
-            Tokens [b s d].
+            text: [b l d], context of cross-attention.
+            condition_start: index of the first condition token, which attend to one another only; None has none.
+            cache: keys and values of condition tokens for the tokens before `condition_start`.
         """
         shift_sa, scale_sa, gate_sa, shift_ffn, scale_ffn, gate_ffn = self._chunks(modulation, levels)
         modulated = modulate(tokens, shift_sa, scale_sa, self.dtype, self.epsilon)
         attended = self.self_attn(modulated, rotary=rotary, condition_start=condition_start, cache=cache)
         tokens = add(tokens, attended, gate_sa)
-        asked = self.norm3(tokens).astype(self.dtype)
-        read = self.cross_attn.attend_by_frame(asked, text) if isinstance(text, FramedContext) else self.cross_attn(asked, text)
+        query = self.norm3(tokens).astype(self.dtype)
+        read = self.cross_attn.attend_by_frame(query, text) if isinstance(text, FramedContext) else self.cross_attn(query, text)
         tokens = add(tokens, read)
         return add(tokens, self.ffn(modulate(tokens, shift_ffn, scale_ffn, self.dtype, self.epsilon)), gate_ffn)
 
     def keys_values(
         self, tokens: Float[Array, "b s d"], modulation: Float[Array, "b r 6 d"], levels: Levels, rotary: Rotary
     ) -> tuple[Float[Array, "b s heads k"], Float[Array, "b s heads k"]]:
-        """What others' self-attention reads of these tokens: keys and values [b s n head_dim]; arguments as of `__call__`."""
+        """Keys and values [b s n head_dim] of these tokens in self-attention; arguments as of `__call__`."""
         shift, scale = self._chunks(modulation, levels)[:2]
         return self.self_attn.keys_values(modulate(tokens, shift, scale, self.dtype, self.epsilon), rotary)
 
     def _chunks(self, modulation: Array, levels: np.ndarray) -> list[Array]:
-        """Six [b s d]: shift, scale and gate of self-attention, then of the feed-forward; never formed at once."""
+        """Six [b s d]: shift, scale and gate of self-attention, then of the feed-forward."""
         chunks = self.modulation[...][None] + modulation
         return [select_levels(chunks[:, :, i], levels) for i in range(6)]
 
@@ -149,32 +140,26 @@ class Attention(nnx.Module):
         condition_start: int | None = None,
         cache: ConditionCache | None = None,
     ) -> Float[Array, "b s d"]:
-        """Tokens attend to context, or to each other under rotary positions.
+        """Attention [b s d] of tokens to a context, or to each other with rotary positions.
 
         Args:
             tokens: [b s d].
-            context: [b l d]; the tokens themselves if left out.
+            context: [b l d]; by default the tokens.
             rotary: rotations of the tokens' positions.
-            condition_start: tokens from here on see none before them, by two calls of attention instead of a mask [s s].
-            cache: keys and values of one layer, attended to with the tokens' own.
-
-        Returns:
-            [b s d].
+            condition_start: as of `Block`; two calls of attention instead of a mask [s s].
+            cache: additional keys and values of one layer.
         """
         q = self._heads(self.norm_q(self.q(tokens)), rotary)
         k, v = self.keys_values(tokens if context is None else context, rotary)
         if cache is not None:
             k, v = jnp.concatenate([k, cache.keys], axis=1), jnp.concatenate([v, cache.values], axis=1)
-        if condition_start is None:
-            attended = self._attend(q, k, v)
-        else:
-            start = condition_start
-            rgb, conditions = self._attend(q[:, :start], k, v), self._attend(q[:, start:], k[:, start:], v[:, start:])
-            attended = jnp.concatenate([rgb, conditions], axis=1)
+        attended = self._attend(q[:, :condition_start], k, v)
+        if (start := condition_start) is not None:
+            attended = jnp.concatenate([attended, self._attend(q[:, start:], k[:, start:], v[:, start:])], axis=1)
         return self.o(attended.reshape(tokens.shape))
 
     def attend_by_frame(self, tokens: Float[Array, "b s d"], context: FramedContext) -> Float[Array, "b s d"]:
-        """Tokens [b s d] attend to the shared context, those of the first frames to their own frame's beside it: [b s d]."""
+        """Attention [b s d] of tokens [b s d] to the shared context and, for the first frames, to their frame's context."""
         batch, frames, own, width = context.framed.shape
         shared = self.keys_values(context.shared, None)
         k, v = (
@@ -194,7 +179,7 @@ class Attention(nnx.Module):
     def keys_values(
         self, context: Float[Array, "b s d"], rotary: Rotary | None
     ) -> tuple[Float[Array, "b s heads k"], Float[Array, "b s heads k"]]:
-        """Keys (rotated where there are positions) and values [b s n head_dim] of context [b s d]."""
+        """Keys (rotated if there are positions) and values [b s n head_dim] of context [b s d]."""
         return self._heads(self.norm_k(self.k(context)), rotary), self._heads(self.v(context), None)
 
     def _heads(self, values: Array, rotary: Rotary | None) -> Array:
@@ -209,7 +194,7 @@ class Attention(nnx.Module):
 
 
 class Head(nnx.Module):
-    """Norm modulated by the time embedding itself (not by its projection), then one linear layer, zero at the start."""
+    """Norm, modulated by the time embedding, and a linear layer that starts at zero."""
 
     def __init__(self, dim: int, features: int, rngs: nnx.Rngs, epsilon: float = EPSILON) -> None:
         self.epsilon = epsilon
@@ -219,13 +204,7 @@ class Head(nnx.Module):
     def __call__(
         self, tokens: Float[Array, "b s d"], time: Float[Array, "b r d"], levels: Levels
     ) -> Float[Array, "b s features"]:
-        """Features [b s pt*ph*pw*c] float32 of tokens.
-
-        Args:
-            tokens: [b s d] float32.
-            time: [b r d] float32, embeddings of the noise levels.
-            levels: [s], which of them each token takes.
-        """
+        """Tokens [b s d], time embeddings [b r d] of the levels and each token's level [s] -> [b s pt*ph*pw*c], all float32."""
         chunks = self.modulation[...][None] + time[:, :, None]
         shift, scale = (select_levels(chunks[:, :, part], levels) for part in (0, 1))
         return self.head(modulate(tokens, shift, scale, epsilon=self.epsilon))
@@ -260,10 +239,7 @@ def modulate(
     dtype: DTypeLike = jnp.float32,
     epsilon: float = EPSILON,
 ) -> Float[Array, "b s d"]:
-    """LayerNorm of tokens without parameters in float32, then scale and shift, rounded to `dtype` once for all who read it.
-
-    All arrays are [b s d].
-    """
+    """LayerNorm of tokens without parameters in float32, then scale and shift, in `dtype`; all arrays are [b s d]."""
     tokens = tokens.astype(jnp.float32)
     centered = tokens - tokens.mean(-1, keepdims=True)
     normed = centered * jax.lax.rsqrt(jnp.square(centered).mean(-1, keepdims=True) + epsilon)
@@ -273,23 +249,15 @@ def modulate(
 def add(
     tokens: Float[Array, "b s d"], change: Float[Array, "b s d"], gate: Float[Array, "b s d"] | None = None
 ) -> Float[Array, "b s d"]:
-    """The sum tokens + change * gate, all [b s d], computed in float32 and given in the type of the tokens."""
+    """The sum tokens + change * gate, all [b s d], in float32, cast to the type of the tokens."""
     change = change.astype(jnp.float32)
     return (tokens.astype(jnp.float32) + (change if gate is None else change * gate)).astype(tokens.dtype)
 
 
 def select_levels(values: Float[Array, "b r d"], levels: Levels) -> Float[Array, "b s d"]:
-    """Values of each token's noise level, in forms whose gradient is no scatter (slow on every device).
+    """values[:, levels] [b s d] float32 of values [b r d] by level, with a gradient that is not a slow scatter.
 
-    Two levels are a choice, which fuses into what uses it and whose gradient is a masked sum. More (one for each latent
-    frame) are a gather whose gradient is a product with the matrix of ones that says which token has which level.
-
-    Args:
-        values: [b r d] float32, of each level.
-        levels: [s], the level of each token.
-
-    Returns:
-        values[:, levels] [b s d] float32.
+    Two levels are a `where`, which fuses, and more a gather whose gradient is a product with a one-hot matrix.
     """
     count = values.shape[1]
     if count <= 2:
@@ -315,14 +283,14 @@ _gather_levels.defvjp(_gather_levels_forward, _gather_levels_backward)
 
 
 def rotate(values: Float[Array, "b s heads k"], rotary: Rotary) -> Float[Array, "b s heads k"]:
-    """Turn neighboring pairs of features of [b s n k] by each token's angles: [b s n k] float32."""
+    """Rotate neighboring pairs of features of [b s n k] by each token's angles: [b s n k] float32."""
     cos, sin = (table[None, :, None, :, None] for table in rotary)
     pairs = values.reshape(*values.shape[:-1], -1, 2)
     return (pairs * cos + pairs[..., ::-1] * jnp.concatenate([-sin, sin], axis=-1)).reshape(values.shape)
 
 
 def _is_attention(primitive: Any, *_: Any, **__: Any) -> bool:
-    """Results of cuDNN's attention (output and logarithms of its sums), which has no other name to be kept by."""
+    """Whether a primitive is cuDNN's attention, which `checkpoint_name` does not reach."""
     return str(primitive.name).startswith("dot_product_attention_fwd")
 
 
@@ -333,21 +301,20 @@ REMAT: dict[str, Callable[..., bool] | None] = {
     "dots": _POLICIES.save_from_both_policies(_POLICIES.dots_with_no_batch_dims_saveable, _KEEP_ATTENTION),
     "full": None,
 }
-"""Policy of what is kept for the backward pass besides each block's input, by name.
+"""Gradient checkpointing policies: results that each block saves for the backward pass besides its input.
 
 full       nothing: the forward pass is computed twice (4/3 of the work), the least memory
-attention  results of attention, so that all but its quadratic part is computed twice; two widths more a token and block
-dots       results of all matrix products and of attention, so that only norms and activations are computed twice
-none       everything that the backward pass reads
+attention  results of attention: all but its quadratic part is computed twice
+dots       results of attention and all matrix products: only norms and activations are computed twice
+none       everything
 """
 
 
 def choose_attention(head_dim: int, dtype: DTypeLike) -> Literal["xla", "cudnn"]:
     """The implementation of `jax.nn.dot_product_attention` on this machine.
 
-    It is cuDNN's on a CUDA GPU of compute capability 8.0 and up, in bfloat16 or float16, where the width of a head is
-    a multiple of 8 and at most 256 (128 before Hopper, 9.0); else XLA's, which forms [n s s]. (The limits are those that jax
-    itself checks; `attend_in_pairs` sees to the one on the number of tokens.)
+    cuDNN's on a CUDA GPU of compute capability 8.0 and up, in bfloat16 or float16, for heads of a multiple of 8 and at most 256
+    features (128 before 9.0), the limits of jax; else XLA's, which forms [n s s].
     """
     device = jax.devices()[0]
     if device.platform != "gpu" or "cuda" not in device.client.platform_version:
@@ -364,9 +331,9 @@ def attend_in_pairs(
     v: Float[Array, "b s heads k"],
     implementation: Literal["xla", "cudnn"],
 ) -> Float[Array, "b q heads k"]:
-    """Attention [b q heads k] of any numbers of queries [b q heads k] and keys and values [b s heads k], in even numbers.
+    """Attention [b q heads k] of queries [b q heads k] to keys and values [b s heads k], padded to even numbers of tokens.
 
-    cuDNN's gradients take even numbers alone. An odd number gets one more, which is masked and cut off again.
+    cuDNN's gradients need even numbers; the padding is masked and removed.
     """
     queries, keys = q.shape[1], k.shape[1]
     if queries % 2 == 0 and keys % 2 == 0:
@@ -384,21 +351,15 @@ def attend_in_pairs(
 
 
 def gelu(values: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """Gelu of values [...] by its approximation with tanh, as Wan has it."""
+    """Gelu of values [...] with the tanh approximation, as in Wan."""
     return nnx.gelu(values, approximate=True)
 
 
 def scaled_normal(key: Key[Array, ""], shape: tuple[int, ...]) -> Float[Array, "..."]:
-    """Random start of modulations as Wan's: normal numbers float32 of `shape` [... d], over the root of the width d."""
+    """Initial modulations as in Wan: normal numbers float32 of `shape` [... d], over the root of the width d."""
     return jax.random.normal(key, shape, jnp.float32) / np.sqrt(shape[-1]).astype(np.float32)
 
 
-def stacked_blocks(size: ModelSize, dtype: DTypeLike, rngs: nnx.Rngs) -> Block:
-    """`depth` blocks as one whose parameters have a leading layer axis."""
-
-    @nnx.split_rngs(splits=size.depth)
-    @nnx.vmap(in_axes=0, out_axes=0)
-    def create(layer_rngs: nnx.Rngs) -> Block:
-        return Block(size, dtype, layer_rngs)
-
-    return create(rngs)
+def stack_layers(create: Callable[[nnx.Rngs], Any], depth: int, rngs: nnx.Rngs) -> Any:
+    """`depth` layers as one module whose parameters have a leading layer axis."""
+    return nnx.split_rngs(splits=depth)(nnx.vmap(create, in_axes=0, out_axes=0))(rngs)

@@ -1,6 +1,4 @@
-"""The diffusion transformer over token streams (Flax NNX), with the lists of its sizes (MODELS) and streams (STREAMS).
-
-It has Wan2.2-TI2V-5B's block stack.
+"""The diffusion transformer over token streams with Wan2.2-TI2V-5B's block stack (Flax NNX), its sizes and streams.
 
 Reads  latents [b t h w c] of each stream, noise level, text embeddings [b l e]
 Writes velocity [b t h w c] of the RGB stream
@@ -8,7 +6,6 @@ Options: spec.py. To add a size: one line in MODELS. To add a stream: one line i
 
 Shape letters: b batch, t h w c latent video, s tokens (t' h' w' flattened), d width, n heads, r distinct noise levels of
 a sample, l text tokens of e features, k tokens of context (in attention: features of a head).
-Numbers that look arbitrary (eps 1e-6, 256 frequencies, six modulations) are those of the published weights.
 """
 
 import dataclasses
@@ -28,6 +25,7 @@ from xew.model.devices.sharding import gather_parameters, shard_over_batch
 from xew.model.diffusion.flow_matching import velocity_of_residual
 from xew.model.network.blocks import (
     REMAT,
+    Block,
     ConditionCache,
     Head,
     Levels,
@@ -37,7 +35,7 @@ from xew.model.network.blocks import (
     gelu,
     scaled_normal,
     select_levels,
-    stacked_blocks,
+    stack_layers,
 )
 from xew.model.network.mechanisms import MECHANISMS, FramedContext, create_mechanism, linear, ray_maps
 from xew.model.network.spec import Network
@@ -54,12 +52,12 @@ from xew.model.network.tokens import (
 from xew.model.video.frames import TEMPORAL_FACTOR
 
 TIMESTEPS = 1000.0
-"""Factor from a noise level in [0, 1] to the timestep that the network gets as input."""
+"""Factor from a noise level in [0, 1] to the network's timestep."""
 EMBEDDING_INIT = nnx.initializers.normal(0.02)
 
 Latents = Float[Array, "b t h w c"]
 Conditions = Mapping[str, Float[Array, "b ..."]]
-"""Latents [b t' h' w' c] or numbers [b t' n] by the stream or mechanism that they feed."""
+"""Latents [b t' h' w' c] or numbers [b t' n] by stream or mechanism."""
 Text = Float[Array, "b l e"] | Int[Array, "b l"]
 """Embeddings [b l e] of a frozen encoder, or ids [b l] of words."""
 
@@ -73,13 +71,12 @@ MODELS = {
 
 @dataclass(frozen=True)
 class Stream:
-    """One of the sequences of tokens. Only RGB is noised and has a head and a loss."""
+    """One sequence of tokens. Only RGB is noised and has a head and a loss."""
 
     source: Literal["latents", "joints", "history"]
-    """Encoded video [b t h w c], the 16-number action of each latent frame [b t 16], or earlier RGB frames, each encoded
-    alone [b n h w c], which RGB's own patch embedding takes."""
+    """Encoded video [b t h w c], actions of 16 numbers [b t 16], or earlier RGB frames [b n h w c], each encoded alone."""
     timestep: Literal["shared", "clean"]
-    """Noise level that its tokens get as input: RGB's own (0 in latent frame 0), as FlowWAM does, or 0."""
+    """Noise level of its tokens: RGB's (0 in latent frame 0), as in FlowWAM, or 0."""
 
 
 STREAMS = {
@@ -92,19 +89,19 @@ STREAMS = {
 
 
 class WorldModel(nnx.Module):
-    """Predicts the flow-matching velocity of the RGB stream, given clean condition streams."""
+    """Predicts the flow-matching velocity of the RGB stream from clean condition streams."""
 
     def __init__(self, network: Network) -> None:
         self.network = network
         size, channels, dtype, rngs = network.size, network.channels, self.dtype, nnx.Rngs(network.seed)
-        # Earlier frames come right after RGB's tokens, so that all frames that have a context of their own are one piece.
+        # History tokens follow RGB's, so all tokens with a frame context (`FramedContext`) are contiguous.
         self.condition_streams = tuple(sorted((name for name in network.streams if name in STREAMS), key="history".__ne__))
         features = channels * int(np.prod(size.patch))
         self.patch_embedding = linear(features, size.dim, dtype, rngs)
         self.text_embedding = TwoLayer(size.text_dim, size.dim, size.dim, gelu, dtype, EMBEDDING_INIT, rngs)
         self.time_embedding = TwoLayer(TIME_FREQUENCIES, size.dim, size.dim, nnx.silu, jnp.float32, EMBEDDING_INIT, rngs)
         self.time_projection = linear(size.dim, 6 * size.dim, jnp.float32, rngs)
-        self.blocks = stacked_blocks(size, dtype, rngs)
+        self.blocks = stack_layers(lambda layer_rngs: Block(size, dtype, layer_rngs), size.depth, rngs)
         self.head = Head(size.dim, features, rngs, size.epsilon)
         words, normal = network.words, nnx.initializers.normal(1.0)
         self.words = nnx.Embed(words, size.text_dim, embedding_init=normal, rngs=rngs) if words else None
@@ -134,7 +131,7 @@ class WorldModel(nnx.Module):
         return self.network.settings.visibility == "one_way"
 
     def _stream_input(self, stream: Stream, rngs: nnx.Rngs) -> nnx.Module:
-        """Pixel streams start from a copy of RGB's patch embedding, as FlowWAM and the paper do."""
+        """Pixel streams start from a copy of RGB's patch embedding, as in FlowWAM and the paper."""
         if stream.source == "joints":
             return TwoLayer(16, self.size.dim, self.size.dim, nnx.silu, self.dtype, nnx.initializers.xavier_uniform(), rngs)
         return jax.tree.map(jnp.copy, self.patch_embedding)
@@ -147,18 +144,14 @@ class WorldModel(nnx.Module):
         text: Text,
         cache: ConditionCache | None = None,
     ) -> Latents:
-        """Velocity of the RGB latents.
+        """Velocity [b t h w c] float32 of the RGB latents; frame 0 has no meaning.
 
         Args:
             latents: [b t h w c] float32; latent frame 0 is the clean reference.
-            conditions: name of each condition stream or mechanism -> [b t' h' w' c] latents, or [b t' n] numbers. Those of
-                streams are not read where a cache is given.
-            sigma: [b] float32, noise level in [0, 1] of latent frames 1 and on.
-            text: [b l e] float32, zero-padded (there is no mask, as in Wan); or ids [b l] int32 of `words`, 0 for none.
+            conditions: see `Conditions`; streams are not read if there is a cache.
+            sigma: [b] float32, noise level in [0, 1] of latent frames from 1 on.
+            text: [b l e] float32, zero-padded (without a mask, as in Wan); or ids [b l] int32 of `words`, 0 for padding.
             cache: of these conditions and this text, from `condition_cache`.
-
-        Returns:
-            [b t h w c] float32; frame 0 carries no meaning.
         """
         rgb = np.prod(token_grid(latents.shape, self.size.patch)).item()
         tokens, levels, rotary = self.embed_streams(latents, conditions, cached=cache is not None)
@@ -173,10 +166,10 @@ class WorldModel(nnx.Module):
         return velocity_of_residual(predicted, latents, sigma, guess)
 
     def condition_cache(self, conditions: Conditions, text: Text) -> ConditionCache:
-        """Keys and values [layers b s n head_dim] of the condition tokens; they hold for all steps of sampling a clip.
+        """Keys and values [layers b s n head_dim] of the condition tokens, for all sampling steps of a clip.
 
         Raises:
-            ValueError: the model is not `one_way`, so that condition tokens depend on the RGB tokens of each step.
+            ValueError: the model is not `one_way`, so condition tokens depend on the RGB tokens of each step.
         """
         if not self.one_way:
             raise ValueError("condition tokens can only be computed ahead in a model of visibility one_way.")
@@ -195,10 +188,7 @@ class WorldModel(nnx.Module):
     def embed_streams(
         self, latents: Latents, conditions: Conditions, cached: bool = False
     ) -> tuple[Float[Array, "b s d"], Levels, Rotary]:
-        """Tokens [b s d] of all streams, or of RGB's latents alone where the others are cached.
-
-        With them come the index of each one's noise level [s], and cosine and sine of its angles [s head_dim/2].
-        """
+        """Tokens [b s d] of all streams, or of RGB alone if others are cached, with levels [s] and rotations [s angles]."""
         streams = {name: conditions[name] for name in self.condition_streams if not cached}
         tokens, levels, rotary = self._join({"rgb": latents} | streams)
         for name in self._entering("channels"):
@@ -208,7 +198,7 @@ class WorldModel(nnx.Module):
         return tokens, levels, rotary
 
     def _pictures(self, name: str, latents: Latents, conditions: Conditions) -> Float[Array, "b k h w features"]:
-        """What a mechanism joins to RGB's channels, frame by frame: [b k h w features]."""
+        """Pictures [b k h w features] that a mechanism adds to RGB's channels."""
         source = MECHANISMS[name].source
         if source == "reference":
             return jnp.broadcast_to(latents[:, :1], latents.shape)
@@ -225,11 +215,11 @@ class WorldModel(nnx.Module):
 
     @property
     def _history_times(self) -> tuple[float, ...]:
-        """Times of the earlier frames, in latent frames from the clip's first (negative)."""
+        """Times of the earlier frames relative to the clip's first [latent frames]."""
         return tuple(frame / TEMPORAL_FACTOR for frame in self.network.settings.history)
 
     def _stream(self, name: str) -> Stream:
-        """A stream with the noise level that it gets in this model: what RGB does not feed cannot know RGB's."""
+        """A stream with its noise level in this model; in a `one_way` model condition tokens have level 0."""
         stream = STREAMS[name]
         return dataclasses.replace(stream, timestep="clean") if self.one_way and name != "rgb" else stream
 
@@ -241,30 +231,30 @@ class WorldModel(nnx.Module):
         return embed(values).astype(jnp.float32) + self.stream_embeddings[name][None, None]
 
     def embed_time(self, sigma: Float[Array, " b"]) -> Float[Array, "b 2 d"]:
-        """Time embeddings [b 2 d] float32 of the two noise levels of each sample: none, and its own [b]."""
+        """Time embeddings [b 2 d] float32 of the two noise levels of each sample: 0 and sigma [b]."""
         timesteps = jnp.stack([jnp.zeros_like(sigma), TIMESTEPS * sigma], axis=1)
         embed = rounded_sinusoid if self.network.settings.time == "flowwam" else sinusoid
         return self.time_embedding(embed(timesteps))
 
-    def _entering(self, place: str) -> list[str]:
-        """The model's mechanisms that enter the network at one place."""
-        return [name for name in self.mechanisms if MECHANISMS[name].enters == place]
+    def _entering(self, point: str) -> list[str]:
+        """The model's mechanisms at an entry point of the network."""
+        return [name for name in self.mechanisms if MECHANISMS[name].enters == point]
 
     def add_frame_vectors(
         self, time: Float[Array, "b r d"], levels: Levels, shape: Sequence[int], conditions: Conditions
     ) -> tuple[Float[Array, "b r2 d"], Levels]:
-        """Give each latent frame of RGB its own time embedding, with the vectors of the mechanisms that enter there.
+        """Add a time embedding for each latent frame of RGB, with the vectors of the mechanisms that enter there.
 
-        Without such a mechanism all stays as it is. Other streams keep their two levels.
+        Without such a mechanism the arguments are returned unchanged.
 
         Args:
             time: [b r d] float32, embeddings of the noise levels.
-            levels: [s], which of them each token takes.
+            levels: [s], index of each token's level.
             shape: of the RGB latents [b t h w c].
             conditions: as of `__call__`.
 
         Returns:
-            Embeddings [b r+t' d] float32 and the one that each token takes [s].
+            Embeddings [b r+t' d] float32 and the index of each token's [s].
         """
         names = self._entering("time")
         if not names:
@@ -276,12 +266,7 @@ class WorldModel(nnx.Module):
         return jnp.concatenate([time, vectors], axis=1), np.concatenate([own, levels[len(own) :]])
 
     def context(self, text: Text, conditions: Conditions | None = None) -> Float[Array, "b k d"]:
-        """What the cross-attention of all tokens reads: [b k d].
-
-        Args:
-            text: embeddings [b l e], or ids of words [b l].
-            conditions: of mechanisms whose tokens stand next to the text, or instead of it.
-        """
+        """Context [b k d] of all tokens: the text [b l e] or [b l], and tokens of mechanisms next to it or instead of it."""
         names = self._entering("context")
         tokens = [self.mechanisms[name]((conditions or {})[name]).astype(self.dtype) for name in names]
         if any(MECHANISMS[name].replaces_text for name in names):
@@ -291,16 +276,12 @@ class WorldModel(nnx.Module):
         return jnp.concatenate([self.text_embedding(text), *tokens], axis=1)
 
     def framed_context(self, text: Text, shape: Sequence[int], conditions: Conditions) -> Float[Array, "b k d"] | FramedContext:
-        """What cross-attention reads: `context`, and with it what only the tokens of one frame read.
+        """`context` [b k d], and if mechanisms have tokens of single frames, these [b f k d]: RGB's, then the history's.
 
         Args:
-            text: as of `context`.
+            text: as of `__call__`.
             shape: of the RGB latents [b t h w c].
             conditions: as of `__call__`.
-
-        Returns:
-            [b k d] where no mechanism has tokens of single frames. Else these come with it, [b f k d]: those of RGB's frames
-            and, after them as in the tokens, those of the history.
         """
         shared, names = self.context(text, conditions), self._entering("frame")
         if not names:
@@ -324,9 +305,9 @@ class WorldModel(nnx.Module):
         rgb: int | None = None,
         cache: ConditionCache | None = None,
     ) -> Float[Array, "b s d"]:
-        """Apply the block stack to tokens [b s d], as a scan over the leading axis of the stacked parameters.
+        """Apply the block stack to tokens [b s d] as a scan over the layers.
 
-        Args as of `Block.__call__`, but `rgb`: number of RGB's tokens, which come first; and `cache`: from `condition_cache`.
+        Arguments as of `Block.__call__`; `rgb` is the number of RGB's tokens, which come first.
         """
         graph, layers = nnx.split(self.blocks)
         start = rgb if self.one_way and rgb != tokens.shape[1] else None
@@ -338,39 +319,38 @@ class WorldModel(nnx.Module):
 
         remat, unroll = self.network.settings.remat, self.network.unroll
         if remat != "none":
-            # The loop already keeps recomputation apart from the forward pass; only without a loop must it be forced.
+            # A loop keeps recomputation apart from the forward pass; without one it must be forced.
             block = jax.checkpoint(block, policy=REMAT[remat], prevent_cse=unroll >= self.size.depth)
         return jax.lax.scan(block, tokens, (layers, cache), unroll=unroll)[0]
 
 
 @functools.lru_cache(maxsize=16)
 def _split_shapes(network: Network) -> tuple[nnx.GraphDef, Any]:
-    """Structure and shapes of a network. To trace its making takes a second, and a command asks several times."""
+    """Structure and shapes of a network; cached, because tracing takes a second."""
     return nnx.split(nnx.eval_shape(lambda: WorldModel(network)), nnx.Param)
 
 
 def network_graph(network: Network) -> nnx.GraphDef:
-    """The structure of a network without its parameters, made without computing anything."""
+    """The structure of a network without its parameters."""
     return _split_shapes(network)[0]
 
 
 def network_shapes(network: Network) -> Any:
-    """Shapes and types of a network's parameters, in their tree, made without computing anything."""
-    return jax.tree.map(lambda leaf: leaf, _split_shapes(network)[1])  # a copy of the tree, which the caller may change
+    """Shapes and types of a network's parameters, in their tree."""
+    return jax.tree.map(lambda leaf: leaf, _split_shapes(network)[1])  # a copy, which the caller may change
 
 
 def token_levels(stream: Stream, grid: TokenGrid) -> Levels:
-    """Index [s] of the noise level that each token of a stream gets: 0 is no noise, 1 the sample's own."""
+    """Index [s] of the noise level of each token of a stream: 0 is no noise, 1 the sample's level."""
     frames = np.zeros(grid[0], int) if stream.timestep == "clean" else np.minimum(np.arange(grid[0]), 1)
     return np.repeat(frames, grid[1] * grid[2])
 
 
 def cast_params(graph: nnx.GraphDef, params: Any) -> Any:
-    """Cast every matrix to the type in which its product is computed; the other parameters stay as they are.
+    """Cast every matrix of linear layers to the type of its product.
 
-    With it the rounding is done once, before the loop over blocks (and over the steps of a sampler), instead of in every
-    block of every pass, and sharded parameters are gathered in half the bytes. Within a loss it is differentiable: the
-    gradients leave it in the type of the master copy.
+    The rounding is done once instead of in every pass, and sharded parameters are gathered in half the bytes. Gradients
+    through it have the type of `params`.
     """
     model = nnx.merge(graph, params)
     types = {path: module.dtype for path, module in nnx.iter_modules(model) if isinstance(module, nnx.Linear) and module.dtype}

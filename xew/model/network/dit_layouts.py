@@ -1,7 +1,6 @@
-"""Published weights of the network: where each leaf lies in the files of Wan2.2 (official and diffusers), FlowWAM and BWM.
+"""Names of the network's parameters in published weights: Wan2.2 (official and diffusers), FlowWAM and BWM.
 
-Reads and writes checkpoints through xew/model/weights.
-Names: Wan2.2's own `wan/modules/model.py`, diffusers' `WanTransformer3DModel`, FlowWAM's `flow_stream`.
+Sources: Wan2.2's `wan/modules/model.py`, diffusers' `WanTransformer3DModel`, FlowWAM's `flow_stream`.
 """
 
 import json
@@ -25,9 +24,9 @@ from xew.model.weights.writing import save_weights
 
 Naming = Literal["official", "diffusers"]
 ROPE_BASE = "_rope_base"
-"""Key of config.json for the base of rotary positions; diffusers passes over keys that begin so."""
+"""Key of config.json for the base of rotary positions; diffusers ignores keys with a leading underscore."""
 COLUMN = {"official": 0, "diffusers": 1}
-"""Place of a project's name in the pairs below."""
+"""Index of each project's name in the pairs below."""
 
 LINEARS = {
     "text_embedding.first": ("text_embedding.0", "condition_embedder.text_embedder.linear_1"),
@@ -37,7 +36,7 @@ LINEARS = {
     "time_projection": ("time_projection.1", "condition_embedder.time_proj"),
     "head.head": ("head.head", "proj_out"),
 }
-"""Names of each of our modules in both projects; all have a weight and a bias."""
+"""Names of xew's modules in both projects; all have a weight and a bias."""
 BLOCK_LINEARS = {
     **{
         f"{ours}.{part}": (f"{ours}.{part}", f"{theirs}.{their_part}")
@@ -57,20 +56,19 @@ BLOCK_VECTORS = {
     "norm3.bias": ("norm3.bias", "norm2.bias"),
     "modulation": ("modulation", "scale_shift_table"),
 }
-"""Norms and modulation. What Wan calls norm3 is diffusers' norm2; the norms without parameters have the other two names."""
+"""Norms and modulation; Wan's norm3 is norm2 in diffusers."""
 
 FLOW_STREAM = "action"
-"""Stream of ours that FlowWAM's optical-flow stream becomes."""
+"""xew's stream for FlowWAM's optical-flow stream."""
 BWM_LINEARS = {
     "mechanisms.pose_context.first": "action_encoder.action_mlp1.0",
     "mechanisms.pose_context.second": "action_encoder.action_mlp1.2",
     "mechanisms.pose_time.first": "action_encoder.action_mlp2.0",
     "mechanisms.pose_time.second": "action_encoder.action_mlp2.2",
 }
-"""Names in Boundless-World-Model of the two paths of its tool poses (action bwm), which it has besides Wan's keys."""
+"""Names of the two tool-pose mechanisms (action bwm) in Boundless-World-Model."""
 NOT_OURS = ("flow_stream.flow_head.*", "action_encoder.action_embedding.*")
-"""Patterns of keys that we do not use. FlowWAM has a head for its flow too, which its published file may lack; BWM's class has
-an embedding that its network does not use."""
+"""Patterns of unused keys: FlowWAM's head for flow, and an embedding that BWM itself does not use."""
 
 
 def wan_layout(model: WorldModel, naming: Naming) -> Layout:
@@ -89,7 +87,7 @@ def wan_layout(model: WorldModel, naming: Naming) -> Layout:
 
 
 def flowwam_layout(model: WorldModel) -> Layout:
-    """What FlowWAM has besides: the patch embedding and the embedding of its flow stream."""
+    """FlowWAM's additional tensors: the patch embedding and the embedding of its flow stream."""
     if FLOW_STREAM not in model.condition_streams:
         return {}
     embedding = Source(("flow_stream.stream_embed",), "leading_ones", (1, 1))
@@ -98,7 +96,7 @@ def flowwam_layout(model: WorldModel) -> Layout:
 
 
 def bwm_layout(model: WorldModel) -> Layout:
-    """What Boundless-World-Model has besides: its two paths of tool poses."""
+    """Boundless-World-Model's additional tensors: its two tool-pose mechanisms."""
     layout: dict[str, Source] = {}
     for ours, theirs in BWM_LINEARS.items():
         if ours.split(".")[1] in model.mechanisms:
@@ -107,26 +105,26 @@ def bwm_layout(model: WorldModel) -> Layout:
 
 
 def dit_layout(model: WorldModel, naming: Naming) -> Layout:
-    """Every leaf of a model: Wan's, FlowWAM's, BWM's, and under their own paths those that no other project has."""
+    """Every leaf of a model: Wan's, FlowWAM's, BWM's, and xew's own under their paths."""
     named = {**wan_layout(model, naming), **flowwam_layout(model), **bwm_layout(model)}
     paths = (".".join(map(str, path)) for path, _ in nnx.to_flat_state(nnx.state(model, nnx.Param)))
     return named | {path: Source((path,)) for path in paths if path not in named}
 
 
 def load_dit(model: WorldModel, path: Path) -> None:
-    """Fill a model in place from published weights: official Wan, diffusers' (its keys say which), or FlowWAM.
+    """Fill a model in place from published weights of Wan (official or diffusers), FlowWAM or BWM.
 
-    What the file lacks of the streams starts from what it has: a picture stream's patch embedding becomes a copy of the
-    loaded RGB one. FlowWAM's flow stream without a stream embedding gets none (zeros), as its world model was trained;
-    other new leaves (stream embeddings, numeric streams, mechanisms, words) keep their random start.
+    Missing patch embeddings of picture streams become copies of RGB's. A missing embedding of FlowWAM's flow stream
+    becomes zeros, as in its training. Other missing leaves (stream embeddings, numeric streams, mechanisms, words) keep their
+    initial values.
 
     Args:
-        model: of any size; of `nnx.eval_shape` only if the file has all of its leaves.
+        model: of any size; abstract (of `nnx.eval_shape`) only if the file has all of its leaves.
         path: as for `reading.read_tensors`.
 
     Raises:
         ConfigError: tensors are missing, left over or of another shape, or config.json next to them has other norms or
-            positions than the model's.
+            positions than the model.
     """
     tensors = read_tensors(path)
     _check_constants(model, tensors)
@@ -141,14 +139,14 @@ def load_dit(model: WorldModel, path: Path) -> None:
 
 
 def check_dit(model: WorldModel, tensors: Tensors) -> None:
-    """Raise what `load_dit` would of these tensors, without reading one; `model` may be of `nnx.eval_shape`."""
+    """Raise the errors of `load_dit` without reading the tensors; `model` may be abstract (of `nnx.eval_shape`)."""
     _check_constants(model, tensors)
     layout, optional = _find_layout(model, tensors)
     check_fit(model, tensors, layout, optional=optional)
 
 
 def _check_constants(model: WorldModel, tensors: Tensors) -> None:
-    """Raise ConfigError if config.json next to the weights says another eps or base of positions than the model's."""
+    """Raise ConfigError if config.json next to the weights has another eps or base of positions than the model."""
     config, size = tensors.config, model.size
     for key, field in (("eps", "epsilon"), (ROPE_BASE, "rotary_base")):
         theirs, ours = config.get(key, getattr(size, field)), getattr(size, field)
@@ -160,14 +158,14 @@ def _check_constants(model: WorldModel, tensors: Tensors) -> None:
 
 
 def _find_layout(model: WorldModel, tensors: Tensors) -> tuple[Layout, tuple[str, ...]]:
-    """The layout of a checkpoint; leaves that it may lack (all that Wan does not have) and keys that it may have besides."""
+    """The layout of a checkpoint, and patterns of optional leaves (all that Wan does not have) and of unused keys."""
     naming = find_naming(tensors)
     layout = dit_layout(model, naming)
     return layout, (*(layout.keys() - wan_layout(model, naming).keys()), *NOT_OURS)
 
 
 def load_dit_params(graph: nnx.GraphDef, params: Any, path: Path) -> Any:
-    """`load_dit` for split models: the parameters with what the file has in them, each placed as it was."""
+    """`load_dit` for a split model; returns the loaded parameters with the placement of `params`."""
     model = nnx.merge(graph, params)
     load_dit(model, path)
     return nnx.state(model, nnx.Param)
@@ -176,8 +174,8 @@ def load_dit_params(graph: nnx.GraphDef, params: Any, path: Path) -> Any:
 def save_dit(model: WorldModel, path: Path, naming: Naming = "diffusers") -> None:
     """Write a model as safetensors (one file, or a folder of shards) under the names of a project.
 
-    A folder of diffusers' names gets its config.json too, so that `WanTransformer3DModel.from_pretrained` opens it. What
-    streams, mechanisms and words add is written with them, under the names that `load_dit` knows; that class passes over it.
+    A folder with diffusers' names gets a config.json for `WanTransformer3DModel.from_pretrained`, which ignores the tensors of
+    streams, mechanisms and words.
 
     Raises:
         ConfigError: the file cannot be written.
@@ -188,7 +186,7 @@ def save_dit(model: WorldModel, path: Path, naming: Naming = "diffusers") -> Non
 
 
 def diffusers_config(model: WorldModel) -> dict[str, Any]:
-    """Arguments of `WanTransformer3DModel`, and under ROPE_BASE what it has no argument for: it turns with base 10,000."""
+    """Arguments of `WanTransformer3DModel`, and the base of positions, which that class fixes at 10,000."""
     size = model.size
     return {
         "_class_name": "WanTransformer3DModel",

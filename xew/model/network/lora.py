@@ -1,8 +1,6 @@
-"""LoRA: low-rank corrections of the blocks' matrices, by which a trained run is adapted to a new robot.
+"""LoRA (Hu et al. 2021, arXiv 2106.09685): low-rank corrections W + A B of the blocks' matrices, to adapt a trained run.
 
-LoRA (Hu et al. 2021, arXiv 2106.09685) leaves the run's weights as they are and learns W + A B, where A has `rank` columns.
-The paper's few-shot protocol changes all weights on the target's episodes alone; this is one of two remedies against
-forgetting that it leaves open (the other is replay, in training/data.py).
+The paper's few-shot protocol fine-tunes all weights on the target's episodes; LoRA and replay are options against forgetting.
 """
 
 from typing import Any
@@ -16,16 +14,13 @@ from jaxtyping import Float, Key
 from xew.model.devices.sharding import LAYERS, path_names
 
 LORA_LAYERS = ("q", "k", "v", "o", "first", "second")
-"""Names of the linear layers in a block that get corrections: both attentions' and the feed-forward's."""
+"""Names of the corrected linear layers in a block: both attentions' and the feed-forward's."""
 Lora = dict[str, dict[str, dict[str, Float[Array, "layers i o"]]]]
 """Matrices A [layers in rank] and B [layers rank out] float32, as {"blocks": {"self_attn.q.kernel": {"a": A, "b": B}, …}}."""
 
 
 def init_lora(params: Any, rank: int, key: Key[Array, ""]) -> Lora:
-    """Corrections that change nothing yet: A is normal over the root of its inputs, B is zero.
-
-    In the blocks of `params` matrices are [layers in out]; A has `rank` columns.
-    """
+    """Initial corrections of the matrices [layers in out] in the blocks: A [layers in rank] is random, B is zero."""
     learned = {}
     for path, leaf in jax.tree_util.tree_leaves_with_path(params):
         names = path_names(path)
@@ -38,7 +33,7 @@ def init_lora(params: Any, rank: int, key: Key[Array, ""]) -> Lora:
 
 
 def apply_lora(base: Any, learned: Any) -> Any:
-    """The network's parameters: `base` plus its corrections (see `Lora`), or without a base what was learned itself."""
+    """The network's parameters: `base` plus its corrections (see `Lora`), or `learned` if there is no base."""
     if base is None:
         return learned
 

@@ -1,14 +1,12 @@
-"""Ways into the network besides token streams: how other systems condition a video model on what the robot does.
+"""Conditioning mechanisms of other systems, besides token streams.
 
-Reads  numbers of the commands [b f n], or latents [b t h w c], of each way that a model has
-Writes what the network adds or attends to: vectors, context tokens, features of patches
-To add a way: a module and one line in MECHANISMS; what feeds it is said in `conditions.ACTIONS`.
+To add a mechanism: a module and one line in MECHANISMS; `conditions.ACTIONS` assigns its input.
 
-Each mechanism enters the network in one of four places, and a system is a combination of them:
+Each mechanism enters the network at one of four points, and a system is a combination of mechanisms:
     time     a vector for each latent frame, added to the time embedding of that frame's RGB tokens (IRASim, BWM)
     frame    tokens that only the tokens of their own latent frame attend to (Ctrl-World)
     context  tokens that all tokens attend to, next to the text or instead of it (EnerVerse-AC, BWM)
-    channels pictures joined to RGB's latents before they are embedded (EnerVerse-AC); the clip's own first frame can be one
+    channels pictures, or the clip's first frame, added to RGB's channels before the patch embedding (EnerVerse-AC)
 
 Shape letters: b batch, t h w c latent video, f latent frames (earlier ones first), n numbers, d width, k context tokens.
 """
@@ -30,16 +28,15 @@ from xew.episode import HEIGHT, WIDTH
 from xew.model.video.frames import TEMPORAL_FACTOR, padding_to
 
 TOOLS = 14
-"""Number of numbers of two tools: position, roll, pitch, yaw and gripper of each."""
+"""Number of values of two tools: position, roll, pitch, yaw and gripper of each."""
 CAMERA = 16
-"""Number of numbers of a camera: fx fy cx cy [pixels of the camera], rotation from world to camera [9], position [3, m]."""
+"""Number of values of a camera: fx fy cx cy [pixels of the camera], rotation from world to camera [9], position [3, m]."""
 RAY_CHANNELS = 6
-"""Number of numbers of a latent pixel of a ray map: direction and origin."""
+"""Number of channels of a ray map: direction and origin."""
 HIDDEN = 4
-"""Width of the hidden layer of per-frame vectors, in widths of the network (IRASim and BWM alike)."""
+"""Width of the hidden layer of per-frame vectors relative to the network's width (IRASim, BWM)."""
 POOLED_TOKENS, POOLING_LAYERS = 16, 2
-"""Number of queries and of layers of the resampler. EnerVerse-AC's has 16 queries and four layers of its own width; ours has
-the network's width and two."""
+"""Number of queries and of layers of the resampler; EnerVerse-AC's has four narrower layers."""
 
 Activation = Callable[[Array], Array]
 
@@ -47,8 +44,7 @@ Activation = Callable[[Array], Array]
 class FrameVector(nnx.Module):
     """Two layers from the four actions of a latent frame to a vector of the time embedding's width.
 
-    The second layer starts at zero, so that a pretrained network starts as it is. With `null`, latent frame 0 gets a
-    learned vector instead: no action led to it.
+    The second layer starts at zero, to leave a pretrained network unchanged. With `null`, latent frame 0 gets a learned vector.
     """
 
     def __init__(self, dim: int, numbers: int, activation: Activation, null: bool, rngs: nnx.Rngs) -> None:
@@ -108,7 +104,7 @@ class PooledTokens(nnx.Module):
 
 
 class PoolingLayer(nnx.Module):
-    """Queries attend to the actions and to themselves, then a feed-forward layer; both on top of what came in."""
+    """Residual attention of queries to the actions and themselves, then a residual feed-forward layer."""
 
     def __init__(self, dim: int, heads: int, dtype: DTypeLike, rngs: nnx.Rngs) -> None:
         self.norm_tokens, self.norm_actions, self.norm = (nnx.LayerNorm(dim, dtype=jnp.float32, rngs=rngs) for _ in range(3))
@@ -117,14 +113,14 @@ class PoolingLayer(nnx.Module):
 
     def __call__(self, tokens: Float[Array, "b 16 d"], actions: Float[Array, "b k d"]) -> Float[Array, "b 16 d"]:
         """Tokens [b 16 d] and actions [b k d] -> tokens [b 16 d], all float32."""
-        asked = self.norm_tokens(tokens)
-        seen = jnp.concatenate([self.norm_actions(actions), asked], axis=1)
-        tokens = tokens + self.attention(asked, seen).astype(jnp.float32)
+        queries = self.norm_tokens(tokens)
+        keys = jnp.concatenate([self.norm_actions(actions), queries], axis=1)
+        tokens = tokens + self.attention(queries, keys).astype(jnp.float32)
         return tokens + self.second(nnx.gelu(self.first(self.norm(tokens)))).astype(jnp.float32)
 
 
 class Channels(nnx.Module):
-    """More channels of RGB's patches: new columns of its patch embedding, at zero to begin with, kept apart from it."""
+    """Additional columns of RGB's patch embedding for additional channels, initially zero."""
 
     def __init__(self, dim: int, features: int, dtype: DTypeLike, rngs: nnx.Rngs) -> None:
         self.columns = nnx.Linear(
@@ -132,24 +128,25 @@ class Channels(nnx.Module):
         )
 
     def __call__(self, patches: Float[Array, "b s features"]) -> Float[Array, "b s d"]:
-        """Patches [b s features] -> [b s d] to be added to RGB's tokens."""
+        """Patches [b s features] -> [b s d] to add to RGB's tokens."""
         return self.columns(patches)
 
 
 @dataclass(frozen=True)
 class Mechanism:
-    """One way into the network."""
+    """A conditioning mechanism."""
 
     enters: Literal["time", "frame", "context", "channels"]
+    """Entry point."""
     source: Literal["numbers", "camera", "latents", "reference"]
-    """Input: `width` numbers for each latent frame, the camera's 16 (drawn as a map of rays), encoded pictures, or the clip's
-    own first latent frame, which no condition feeds."""
+    """Input: `width` numbers for each latent frame, the camera as a ray map, encoded pictures, or the clip's first latent
+    frame, which needs no condition."""
     build: Callable[[Any, int, DTypeLike, nnx.Rngs], nnx.Module]
-    """Function (`dit.ModelSize`, features of a patch of the source, dtype of products, rngs) -> the module."""
+    """Function (`dit.ModelSize`, features of a patch of the source, dtype of products, rngs) -> module."""
     width: int = 0
-    """Number of numbers of a latent frame; 0 for pictures."""
+    """Number of input values of a latent frame; 0 for pictures."""
     replaces_text: bool = False
-    """Whether its context replaces the text, which is then not attended to."""
+    """Whether its context replaces the text."""
 
 
 def _frame_vector(activation: Activation, null: bool) -> Callable[[Any, int, DTypeLike, nnx.Rngs], nnx.Module]:
@@ -188,38 +185,35 @@ MECHANISMS = {
 
 
 class FramedContext(NamedTuple):
-    """What cross-attention reads where frames have a context of their own."""
+    """Context of cross-attention if mechanisms have tokens of single frames."""
 
     shared: Float[Array, "b k d"]
-    """Context [b k d] of every token: the text's embeddings, or what stands in their place."""
+    """Context [b k d] of every token."""
     framed: Float[Array, "b f m d"]
-    """Context [b f k d] beside it for the tokens of one frame each: the first f * `tokens` tokens, frame by frame."""
+    """Additional context [b f k d] of each frame, for the first f * `tokens` tokens."""
     tokens: int
     """Number of tokens of a frame."""
 
 
 def create_mechanism(name: str, size: Any, channels: int, dtype: DTypeLike, rngs: nnx.Rngs) -> nnx.Module:
-    """The module of a mechanism for a network of this size whose latents have so many channels."""
+    """The module of a mechanism for a network of this size on latents with this many channels."""
     mechanism = MECHANISMS[name]
     of_pixel = RAY_CHANNELS if mechanism.source == "camera" else channels
     return mechanism.build(size, of_pixel * math.prod(size.patch), dtype, rngs)
 
 
 def frames_of_groups(numbers: Float[Array, "b t n"]) -> Float[Array, "b k m"]:
-    """Numbers of latent frames [b t 4*n] -> of frames of video [b 4*(t-1)+1 n]; the first group is one frame, four times."""
+    """Numbers of latent frames [b t 4*n] -> of frames of video [b 4*(t-1)+1 n]; the first group repeats one frame."""
     frames = numbers.reshape(len(numbers), TEMPORAL_FACTOR * numbers.shape[1], -1)
     return frames[:, TEMPORAL_FACTOR - 1 :]
 
 
 def ray_maps(camera: Float[Array, "b t 16"], shape: Sequence[int]) -> Float[Array, "b t h w 6"]:
-    """View ray of each latent pixel: unit direction and origin of its ray in the world (EnerVerse-AC's ray maps).
+    """Unit direction and origin [m] in the world of each latent pixel's ray, [b t h w 6] float32 (EnerVerse-AC).
 
     Args:
         camera: [b t 16], see `CAMERA`.
-        shape: of the latents [b t h w c], whose frames are the camera's after `frames.to_model_size`.
-
-    Returns:
-        Unit directions and origins [m] in the world [b t h w 6] float32.
+        shape: of the latents [b t h w c], of frames after `frames.to_model_size`.
     """
     height, width = shape[2:4]
     top, bottom, left, right = padding_to(height, width)

@@ -1,7 +1,4 @@
-"""What the network is: each of its options, written here once. A config's `model` section extends `NetworkSettings`.
-
-`dit.WorldModel` computes a `Network`; nothing here needs its parameters.
-"""
+"""Options of the network. A config's `model` section extends `NetworkSettings`; `dit.WorldModel` implements a `Network`."""
 
 from dataclasses import dataclass, field, replace
 from typing import Literal
@@ -12,34 +9,33 @@ Visibility = Literal["joint", "one_way"]
 Prediction = Literal["velocity", "residual"]
 TimeEmbedding = Literal["exact", "flowwam"]
 UNROLL_AT_MOST = 12
-"""Largest number of blocks that a training step compiles as one body, not as a loop. It spares the backward pass its stacked
-arrays, and takes long to compile: a minute and a half on a GPU at 12."""
+"""Largest number of blocks that a training step compiles without a loop, which is faster but takes long to compile."""
 
 
 @dataclass(frozen=True)
 class NetworkSettings:
-    """Options of the network that a config can choose."""
+    """Network options of a config."""
 
     history: tuple[int, ...] = (-400,)
-    """Earlier frames that every clip is given too, counted from the clip's first, as [-40, -20]; before the episode its first
-    frame counts, so that [-400] is the episode's first frame."""
+    """Earlier frames as further input, relative to the clip's first, as [-40, -20]; frames before the episode are its first
+    frame, so [-400] is the episode's first frame."""
     dtype: Literal["float32", "bfloat16"] = "bfloat16"
-    """Type of the matrix products and of the tokens between blocks; parameters, norms, modulation and sums stay float32."""
+    """Type of the matrix products and of the tokens between blocks; parameters, norms, modulation and sums are float32."""
     remat: RematName = "dots"
-    """Part that the backward pass computes again: none, all but attention or matrix products, or everything (blocks.REMAT)."""
+    """Gradient checkpointing: none, attention, dots or full (blocks.REMAT)."""
     visibility: Visibility = "one_way"
-    """joint: all tokens attend to all, as in Wan and FlowWAM. one_way: condition tokens attend to condition tokens only and get
-    the noise level 0, so that a sampler computes them once a clip."""
+    """joint: all tokens attend to all, as in Wan and FlowWAM. one_way: condition tokens attend to one another only, at noise
+    level 0, so a sampler computes them once a clip."""
     time: TimeEmbedding = "exact"
-    """flowwam: with the rounding under which FlowWAM's published weights were trained."""
+    """Time embedding; flowwam has the rounding of FlowWAM's published weights."""
     prediction: Prediction = "residual"
-    """velocity: the head computes the velocity, as in Wan. residual: what a linear guess from the noisy latents and the pasted
-    render (or the clip's first frame, where that is no condition) leaves of the clean ones."""
+    """velocity: the head predicts the velocity, as in Wan. residual: the residual of a linear estimate from the noisy latents
+    and the pasted render, or the clip's first frame if the render is no condition."""
 
 
 @dataclass(frozen=True)
 class Network:
-    """A network without its parameters: all that `WorldModel` needs."""
+    """Definition of a network without its parameters."""
 
     size: ModelSize
     channels: int
@@ -47,14 +43,14 @@ class Network:
     streams: tuple[str, ...] = ()
     """Names in `dit.STREAMS` besides rgb, and in `mechanisms.MECHANISMS`."""
     guess: str = ""
-    """Stream or mechanism whose latents are the guess of a residual; "" takes the first frame, which stands still."""
+    """Stream or mechanism whose latents are the guess of a residual; "" takes the first frame."""
     words: int = 0
-    """Rows of the table of words that the network learns; text is then ids [b l], not embeddings. 0 has none."""
+    """Size of the learned word table, with ids [b l] as text; 0 takes embeddings."""
     seed: int = 0
-    """Seed of the random start."""
+    """Seed of the initial parameters."""
     settings: NetworkSettings = field(default_factory=NetworkSettings)
     unrolled: bool = True
-    """Whether the blocks of a small network are compiled as one body."""
+    """Whether the blocks of a small network are compiled without a loop."""
 
     @property
     def unroll(self) -> int:
@@ -63,5 +59,5 @@ class Network:
 
     @property
     def for_sampling(self) -> "Network":
-        """The same network, with the same parameters, as a sampler compiles it: without a backward pass a loop is as fast."""
+        """The same network with a loop over blocks, which is as fast without a backward pass."""
         return replace(self, unrolled=False)

@@ -1,8 +1,4 @@
-"""Videos to tokens and back, and the features of their place and noise level.
-
-Reads  latents [b t h w c], timesteps
-Writes tokens' features [b s c*ph*pw], rotation angles [s head_dim/2], time features [... 256]
-"""
+"""Latents to tokens and back, and encodings of positions and noise levels."""
 
 from collections.abc import Sequence
 
@@ -22,10 +18,9 @@ TIME_FREQUENCIES = 256
 
 
 def sinusoid(timestep: Float[Array, "*n"]) -> Float[Array, "*n 256"]:
-    """Cosines, then sines [... 256] of float32 timesteps [...], as exact as Wan's float64 (to 2e-7; plain float32: 6e-5).
+    """Cosines, then sines [... 256] of float32 timesteps [...], exact to 2e-7 compared with Wan's float64.
 
-    A timestep times a frequency is split in a product of their upper halves, which float32 holds exactly, and a small
-    rest, by which the angle is turned with the addition theorem.
+    The angle is the exact product of the factors' upper bits plus a small rest, combined by the addition theorem.
     """
     half = TIME_FREQUENCIES // 2
     frequencies = (WAVELENGTH_BASE ** (-np.arange(half) / half)).reshape((1,) * timestep.ndim + (half,))
@@ -41,14 +36,11 @@ def sinusoid(timestep: Float[Array, "*n"]) -> Float[Array, "*n 256"]:
 
 
 UPPER_HALF = np.uint32(0xFFFFF000)
-"""Bits of a float32 number that keep 12 of its 24 significant ones."""
+"""Mask of a float32 number's upper 12 of 24 significant bits."""
 
 
 def rounded_sinusoid(timestep: Float[Array, "*n"]) -> Float[Array, "*n 256"]:
-    """`sinusoid` of timesteps [...] as FlowWAM has it: [... 256] float32.
-
-    The timestep is in bfloat16 (steps of 4 from 512 on), and the result is rounded to bfloat16.
-    """
+    """`sinusoid` of timesteps [...] as in FlowWAM, with timestep and result rounded to bfloat16: [... 256] float32."""
     return sinusoid(timestep.astype(jnp.bfloat16).astype(jnp.float32)).astype(jnp.bfloat16).astype(jnp.float32)
 
 
@@ -62,11 +54,10 @@ def token_grid(shape: Sequence[int], patch: Patch) -> tuple[int, int, int]:
 def rotary_angles(
     grid: tuple[int, int, int], head_dim: int, base: float = WAVELENGTH_BASE, times: Sequence[float] | None = None
 ) -> Float[np.ndarray, "s angles"]:
-    """Rotation angles [s head_dim/2, rad] float64 of the tokens of a grid; every stream counts from (0, 0, 0).
+    """Rotation angles [s head_dim/2, rad] float64 of the tokens of a grid that starts at (0, 0, 0).
 
-    The head is split among time, height and width as in Wan (44, 42, 42 of 128; 24, 20, 20 of 64), and each part has
-    its own geometric series of frequencies, whose fastest is `base` times the slowest. Times of the frames are in latent
-    frames; 0, 1, … if left out.
+    The head is split among time, height and width as in Wan (44, 42, 42 of 128), each with a geometric series of frequencies
+    over a factor of `base`. `times` of the frames are in latent frames, by default 0, 1, …
     """
     part = 2 * (head_dim // 6)
     parts = (head_dim - 2 * part, part, part)

@@ -1,3 +1,3 @@
-"""Runs on disk: what a run folder holds, who may write it, its checkpoints and log, and where an adapted run started from."""
+"""Runs on disk: the run folder, its checkpoints and log, and the origin of an adapted run."""
 
 __all__ = ["checkpoint", "folder", "layout", "log", "roundtrip", "session"]

@@ -1,8 +1,8 @@
-"""Checkpoints of a run (Orbax): written in the background, read on whatever devices there are, as they were written.
+"""Checkpoints of a run (Orbax): written in the background, read on any devices.
 
-Reads, writes <out>/checkpoints/STEP, and <out>/sums/STEP.json: SHA-256 of each of its files, once it is complete
+Reads, writes <out>/checkpoints/STEP, and <out>/sums/STEP.json with the SHA-256 of each of its files
 
-A checkpoint whose sums were not written yet, because the run was killed just then, is read without them.
+A checkpoint without sums, of a run that was killed before writing them, is read without verification.
 """
 
 import contextlib
@@ -29,7 +29,7 @@ from xew.model.runs.folder import KeptStep, trace_run
 from xew.model.runs.layout import list_steps
 
 SUMMING = ThreadPoolExecutor(1, "sums")
-"""Thread in which checksums of earlier checkpoints are computed, during training."""
+"""Thread that computes checksums of earlier checkpoints during training."""
 
 
 @jax.tree_util.register_dataclass
@@ -44,18 +44,18 @@ class TrainState:
     ema: Any = None
     """Moving average of the parameters, or None."""
     base: Any = None
-    """Parameters that stay as they are and that `params` corrects (LoRA), or None; checkpoints do not hold them."""
+    """Frozen parameters that `params` corrects (LoRA), or None; checkpoints do not hold them."""
 
 
 def open_checkpoints(out: Path, keep: int = 1) -> ocp.CheckpointManager:
-    """The checkpoints of a run, written in the background."""
+    """Open the checkpoints of a run, written in the background."""
     options = ocp.CheckpointManagerOptions(max_to_keep=keep, enable_async_checkpointing=True)
     return ocp.CheckpointManager((out / "checkpoints").absolute(), options=options)
 
 
 @contextlib.contextmanager
 def write_checkpoints(out: Path, keep: int = 1) -> Iterator[ocp.CheckpointManager]:
-    """Open the checkpoints of a run that writes them; at the end of the block all are complete and have their sums."""
+    """Open the checkpoints of a run for writing; at the end of the block all are complete and have sums."""
     try:
         with open_checkpoints(out, keep) as checkpoints:
             yield checkpoints
@@ -65,10 +65,7 @@ def write_checkpoints(out: Path, keep: int = 1) -> Iterator[ocp.CheckpointManage
 
 
 def save_state(checkpoints: ocp.CheckpointManager, state: TrainState, data_position: dict[str, Any]) -> None:
-    """Begin to write a checkpoint of the state, named by its step; nothing happens if it is there already.
-
-    The state may be changed as soon as this returns. A checkpoint gets its name when it is complete.
-    """
+    """Start writing a checkpoint of the state unless one of its step exists; the state may be changed on return."""
     step = int(state.step)
     if step in checkpoints.all_steps():
         return
@@ -81,7 +78,7 @@ def save_state(checkpoints: ocp.CheckpointManager, state: TrainState, data_posit
 
 
 def save_params(checkpoints: ocp.CheckpointManager, step: int, params: Any) -> None:
-    """Write a checkpoint of parameters alone, in the types that they have, and wait for it: rollouts can read it."""
+    """Write a checkpoint of parameters alone, for inference, and wait for it."""
     checkpoints.save(step, args=ocp.args.Composite(params=ocp.args.StandardSave(params)))
     checkpoints.wait_until_finished()
 
@@ -90,10 +87,10 @@ def restore_state(checkpoints: ocp.CheckpointManager, like: TrainState) -> tuple
     """Restore the latest state and the position of the data.
 
     Args:
-        like: arrays, or their shapes, types and shardings: where each is to lie, independent of the devices that saved it.
+        like: arrays, or their shapes, types and shardings on the current devices.
 
     Raises:
-        ConfigError: the checkpoint is damaged: something is missing, of another size, changed since, or not finite.
+        ConfigError: the checkpoint is damaged: a part is missing, of another size, changed, or not finite.
     """
     step, out = checkpoints.latest_step(), Path(checkpoints.directory).parent
     items = {"params": like.params, "optimizer": like.optimizer} | ({} if like.ema is None else {"ema": like.ema})
@@ -104,54 +101,48 @@ def restore_state(checkpoints: ocp.CheckpointManager, like: TrainState) -> tuple
     return state, restored["data"]
 
 
-def restore_params(out: Path, like: Any, step: int | None = None) -> tuple[Any, int]:
-    """Restore the network's parameters for inference (the average where one was kept), and their step.
-
-    Of a run with LoRA they are those of the run that it started from, with its corrections added.
-
-    Args:
-        like: the network's parameters, or their shapes, types and shardings.
-        step: of the checkpoint; the latest where left out.
-
-    Raises:
-        ConfigError: the run has no such checkpoint, or what it started from has gone.
-    """
-    return restore_sum(trace_run(out, step), like)
-
-
 def load_params(
     run: Path, network: Network, step: int | None = None, sharding: jax.sharding.Sharding | None = None
 ) -> tuple[Any, int]:
-    """The parameters of a run's network, as `restore_params`, in the types of training; and their step.
+    """Restore the float32 parameters of a run's network for inference (the average if there is one), and their step.
 
-    They lie where `sharding` says, or on the first device.
-    """
-    place = sharding or jax.sharding.SingleDeviceSharding(jax.devices()[0])
-    like = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=place), network_shapes(network))
-    return restore_params(run, like, step)
-
-
-def restore_sum(kept: Sequence[KeptStep], like: Any) -> tuple[Any, int]:
-    """Restore the parameters of a first checkpoint, add the corrections of those after it, and return the last one's step.
+    LoRA corrections are added to the parameters of the run that they start from.
 
     Args:
-        kept: the checkpoints, from `trace_run` or `trace_start`.
+        run: folder of the run.
+        network: its network.
+        step: of the checkpoint, by default the latest.
+        sharding: of the parameters, by default on the first device.
+
+    Raises:
+        ConfigError: the run, or the run that it starts from, has no such checkpoint.
+    """
+    sharding = sharding or jax.sharding.SingleDeviceSharding(jax.devices()[0])
+    like = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding), network_shapes(network))
+    return restore_sum(trace_run(run, step), like)
+
+
+def restore_sum(lineage: Sequence[KeptStep], like: Any) -> tuple[Any, int]:
+    """Restore the parameters of the first checkpoint of a lineage, add the others' LoRA corrections, and return the last step.
+
+    Args:
+        lineage: checkpoints from `trace_run` or `trace_start`.
         like: the network's parameters, or their shapes, types and shardings.
 
     Raises:
         ConfigError: a run has no such checkpoint.
     """
-    first, *adapted = kept
-    params, step = _restore_kept(first.run, like, first.step)
+    first, *adapted = lineage
+    params, step = _restore_inference(first.run, like, first.step)
     for correction in adapted:
         shapes = jax.eval_shape(functools.partial(init_lora, like, correction.adapt.lora_rank, jax.random.key(0)))
-        learned, step = _restore_kept(correction.run, place_like(shapes, like), correction.step)
+        learned, step = _restore_inference(correction.run, place_like(shapes, like), correction.step)
         params = jax.jit(apply_lora)(params, learned)
     return params, step
 
 
-def _restore_kept(out: Path, like: Any, step: int | None) -> tuple[Any, int]:
-    """Restore what a run's checkpoint holds for inference, `ema` or else `params`, and its step; raises as `restore_sum`."""
+def _restore_inference(out: Path, like: Any, step: int | None) -> tuple[Any, int]:
+    """Restore `ema`, or else `params`, of a run's checkpoint, and its step; raises as `restore_sum`."""
     with open_checkpoints(out) as checkpoints:
         steps = checkpoints.all_steps()
         if not steps:
@@ -159,21 +150,21 @@ def _restore_kept(out: Path, like: Any, step: int | None) -> tuple[Any, int]:
         step = max(steps) if step is None else step
         if step not in steps:
             raise ConfigError(f"{out} has no checkpoint of step {step}; it has {', '.join(map(str, sorted(steps)))}.")
-        kept = "ema" if (out / "checkpoints" / str(step) / "ema").exists() else "params"
-        return _restore(checkpoints, out, step, {kept: ocp.args.StandardRestore(_abstract(like))})[kept], step
+        item = "ema" if (out / "checkpoints" / str(step) / "ema").exists() else "params"
+        return _restore(checkpoints, out, step, {item: ocp.args.StandardRestore(_abstract(like))})[item], step
 
 
 def _restore(checkpoints: ocp.CheckpointManager, out: Path, step: int, restores: dict[str, Any]) -> Any:
-    """Restore parts of a checkpoint. Raises ConfigError if they are not what was written, or hold numbers that are none."""
-    if wrong := find_damage(out, step, restores):
-        raise damaged(out, step, restores, wrong)
+    """Restore items of a checkpoint. Raises ConfigError if they are damaged or not finite."""
+    if damage := find_damage(out, step, restores):
+        raise damaged(out, step, restores, damage)
     try:
         restored = checkpoints.restore(step, args=ocp.args.Composite(**restores))
-    except Exception as error:  # Orbax has many, one for each way of being damaged
+    except Exception as error:  # Orbax raises many types
         if "RESOURCE_EXHAUSTED" in str(error):
             raise ConfigError(
-                f"{out}: the checkpoint of step {step} does not fit into the memory that is free on {jax.devices()[0]}; it is "
-                "whole. Stop what else runs there, or wait for it."
+                f"{out}: the checkpoint of step {step} is whole, but does not fit into the free memory of {jax.devices()[0]}; "
+                "stop other programs there, or wait for them."
             ) from error
         raise damaged(out, step, restores, error) from error
     for name in restores.keys() - {"data"}:
@@ -184,7 +175,7 @@ def _restore(checkpoints: ocp.CheckpointManager, out: Path, step: int, restores:
 
 
 def _is_finite(leaf: Any) -> bool:
-    """Whether all numbers of the parts [...] of an array that lie on this process's devices are finite, each part once."""
+    """Whether all numbers of an array [...] on this process's devices are finite."""
     if not jnp.issubdtype(leaf.dtype, jnp.inexact):
         return True
     parts = [shard.data for shard in leaf.addressable_shards if shard.replica_id == 0]
@@ -192,12 +183,12 @@ def _is_finite(leaf: Any) -> bool:
 
 
 def _abstract(tree: Any) -> Any:
-    """Keep only shapes, types and this machine's placement: Orbax would otherwise look for the devices that saved."""
+    """Shapes, types and shardings of a tree, without which Orbax looks for the devices that saved it."""
     return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=leaf.sharding), tree)
 
 
 def note_sums(out: Path) -> None:
-    """Write the sums of all complete checkpoints of a run that have none yet, and remove those of checkpoints that are gone."""
+    """Write missing sums of a run's complete checkpoints, and remove the sums of deleted checkpoints."""
     steps = list_steps(out)
     for step in steps:
         path, folder = _sums(out, step), out / "checkpoints" / str(step)
@@ -208,7 +199,7 @@ def note_sums(out: Path) -> None:
                 file.relative_to(folder).as_posix(): file_digest(file) for file in sorted(folder.rglob("*")) if file.is_file()
             }
             write_text(path, json.dumps(sums, indent=1, sort_keys=True) + "\n")
-        except OSError:  # it is being replaced by a later one, or the disk is full: then it is read without sums
+        except OSError:  # the checkpoint is being replaced, or the disk is full: it is then read without sums
             continue
     for path in (out / "sums").glob("*.json"):
         if path.stem not in map(str, steps):
@@ -216,10 +207,7 @@ def note_sums(out: Path) -> None:
 
 
 def find_damage(out: Path, step: int, items: Collection[str]) -> str:
-    """What is wrong with the files of a checkpoint by its sums; '' where nothing is, or where there are no sums.
-
-    Only the items that are read count, and other files directly in its folder.
-    """
+    """Verify the given items and the top-level files of a checkpoint: the damage, or '' if there is none or no sums."""
     folder, path = out / "checkpoints" / str(step), _sums(out, step)
     if not path.exists():
         return ""
@@ -241,8 +229,8 @@ def find_damage(out: Path, step: int, items: Collection[str]) -> str:
     return ""
 
 
-def damaged(out: Path, step: int, items: Collection[str], what: object) -> ConfigError:
-    """The error for a damaged checkpoint, in one line: what is wrong with which, and the last one that is whole."""
+def damaged(out: Path, step: int, items: Collection[str], damage: object) -> ConfigError:
+    """The error for a damaged checkpoint, which offers the last whole one."""
     whole = [
         other
         for other in list_steps(out)
@@ -251,7 +239,7 @@ def damaged(out: Path, step: int, items: Collection[str], what: object) -> Confi
     offer = "no other is known to be whole: copy the run again, or train it again with --overwrite"
     if whole:
         offer = f"step {whole[-1]} is whole: move that folder away to go on from it, or read it by --checkpoint {whole[-1]}"
-    reason = " ".join(str(what).split())[:200] or type(what).__name__
+    reason = " ".join(str(damage).split())[:200] or type(damage).__name__
     return ConfigError(f"{out / 'checkpoints' / str(step)}: the checkpoint of step {step} is damaged ({reason}); {offer}.")
 
 

@@ -1,13 +1,13 @@
-"""The folder of a run: who may write it, what is written first, what it was trained with, and where its network comes from.
+"""The folder of a run: claiming and reading it, and tracing the checkpoints of an adapted run.
 
 <out>/config.yaml       the resolved config, itself a valid input
 <out>/codec/            the codec that the latents were made with
-<out>/scales.json       normalization of conditions that are numbers, where there are any
+<out>/scales.json       normalization of numeric conditions, if there are any
 <out>/sums/STEP.json    checksums of a checkpoint's files
-<out>/.xew-run          the mark of a run: only the files of a run next to it are ever replaced
-<out>/checkpoints/STEP  params, optimizer, position of the data; ema where one is kept
-<out>/start.json        of an adapted run: where it started from
-<out>/metrics.jsonl     and TensorBoard's event files
+<out>/.xew-run          mark of a run, without which no file is replaced
+<out>/checkpoints/STEP  params, optimizer, position of the data, and ema if there is one
+<out>/start.json        of an adapted run: the checkpoint that it started from
+<out>/metrics.jsonl     training curves, next to TensorBoard's event files
 """
 
 import dataclasses
@@ -38,7 +38,7 @@ from xew.model.weights.reading import read_tensors
 T = TypeVar("T")
 
 START = "start.json"
-"""Name of the file that says, in an adapted run, which checkpoint of which run it started from."""
+"""Name of the file in an adapted run with the checkpoint that it started from."""
 FREE_TO_CHANGE = (
     "data",
     "cache",
@@ -60,13 +60,13 @@ FREE_TO_CHANGE = (
     "report.",
     "rollout.",
 )
-"""Settings that a resumed run may change; any other would make it another experiment."""
+"""Prefixes of the settings that a resumed run may change."""
 
 
 def begin_run(
     experiment: Experiment, codec: Codec, scales: Mapping[str, Scale], *, resume: bool, overwrite: bool
 ) -> dict[str, Scale]:
-    """Make the run folder ready, by the first process, as `prepare_run`; the others wait for it. Returns the run's scales."""
+    """Prepare the run folder in the first process, as `prepare_run`, and return the run's scales."""
     if jax.process_index() == 0:
         prepare_run(experiment, codec, scales, resume=resume, overwrite=overwrite)
     if jax.process_count() > 1:
@@ -75,19 +75,18 @@ def begin_run(
 
 
 def prepare_run(experiment: Experiment, codec: Codec, scales: Mapping[str, Scale], *, resume: bool, overwrite: bool) -> None:
-    """Make a run folder ready, new, continued or replaced, and keep in it what the run is made with and starts from.
+    """Claim a run folder as `check_claim` and `write_claim`, and write codec, scales and, of an adapted run, its start.
 
-    A run that is continued keeps its own scales and start.
+    A resumed run keeps its scales and start.
 
     Raises:
-        ConfigError: it holds a run and neither was asked, it would be continued with another config or codec, or the run to
-            adapt has no checkpoint.
+        ConfigError: as `check_claim`, the run was begun with another codec, or the run to adapt has no checkpoint.
     """
     out, start, steps = experiment.out, experiment.adapt.start_from, list[int]()
     check_claim(out, experiment, load_recorded, resume=resume, overwrite=overwrite)
     if resume and (out / RUN_CODEC).exists():
-        kept = _find_codec(experiment, out)
-        if kept is not None and kept.hash != codec.hash:  # a file of weights may have moved, but must hold the same
+        run_codec = _find_codec(experiment, out)
+        if run_codec is not None and run_codec.hash != codec.hash:
             raise ConfigError(f"{out} was begun with another codec than the config's now; set it back, or choose --out.")
     if start is not None and not (resume and (out / START).exists()):
         steps = list_steps(start)
@@ -109,19 +108,19 @@ def prepare_run(experiment: Experiment, codec: Codec, scales: Mapping[str, Scale
 
 
 def check_one_of(resume: bool, overwrite: bool) -> None:
-    """Raise ConfigError where a run would be both continued and replaced."""
+    """Raise ConfigError if both flags are set."""
     if resume and overwrite:
         raise ConfigError("--resume continues the run in --out, --overwrite replaces it; give one of them.")
 
 
 def claim_run(out: Path, settings: T, read: Callable[[Path], T], *, resume: bool, overwrite: bool) -> None:
-    """Make a folder ready for a run with these settings, new, continued or replaced, and write them there as config.yaml."""
+    """Claim a folder for a run with these settings: `check_claim`, then `write_claim`."""
     check_claim(out, settings, read, resume=resume, overwrite=overwrite)
     write_claim(out, settings, overwrite=overwrite)
 
 
 def check_claim(out: Path, settings: T, read: Callable[[Path], T], *, resume: bool, overwrite: bool) -> None:
-    """Raise ConfigError where a folder holds a run and neither was asked, or one to be continued with another config."""
+    """Raise ConfigError if a folder holds other files, a run without either flag, or a run to resume with another config."""
     saved = out / "config.yaml"
     if out.exists() and not out.is_dir():
         raise ConfigError(f"{out} is a file; choose another --out.")
@@ -136,7 +135,7 @@ def check_claim(out: Path, settings: T, read: Callable[[Path], T], *, resume: bo
 
 
 def _find_codec(experiment: Experiment, out: Path) -> Codec | None:
-    """The codec that a run keeps; None where the run was killed before it was written whole, and so has no checkpoint."""
+    """The codec of a run; None if the run was killed before writing it whole, and so has no checkpoint."""
     try:
         return load_kept_codec(experiment.encoding.kind, out / RUN_CODEC, RUN_REMEDY)
     except ConfigError:
@@ -146,13 +145,13 @@ def _find_codec(experiment: Experiment, out: Path) -> Codec | None:
 
 
 def _is_bare(out: Path) -> bool:
-    """Whether a folder is empty, or holds no more than the mark of a run that was killed before its config was written."""
+    """Whether a folder is empty, or holds only the mark of a run that was killed before its config was written."""
     names = [path.name for path in out.iterdir()]
     return not names or (RUN_MARK in names and all(name.startswith(".") for name in names))
 
 
 def write_claim(out: Path, settings: Any, *, overwrite: bool) -> None:
-    """Write the settings of a run into its folder, which may be claimed, instead of the run there if it is replaced."""
+    """Write the settings of a run into its folder as config.yaml; `overwrite` first removes the run there."""
     saved = out / "config.yaml"
     if overwrite and saved.exists():
         _remove_run(out)
@@ -165,7 +164,7 @@ def write_claim(out: Path, settings: Any, *, overwrite: bool) -> None:
 
 
 def _remove_run(out: Path) -> None:
-    """Remove what trainings have written into the folder of a run. Raises ConfigError if it is none, or holds anything else."""
+    """Remove a run's files from its folder. Raises ConfigError if the folder is not a run's or cannot be changed."""
     if not is_run(out):
         raise ConfigError(f"{out} has a config.yaml but holds no run, so it is not replaced; choose another --out.")
     try:
@@ -174,11 +173,11 @@ def _remove_run(out: Path) -> None:
         raise ConfigError(f"cannot replace the run {out}: {error}; choose another --out.") from error
     if foreign:
         names = ", ".join(str(path.relative_to(out)) for path in foreign[:3])
-        print(f"{out}: the run is replaced; files that are not its own stay there ({names})")
+        print(f"{out}: the run is replaced; other files stay there ({names})")
 
 
 def check_start(experiment: Experiment) -> None:
-    """Raise ConfigError unless what the run starts from fits: the run to adapt, or published weights, if there are any."""
+    """Raise ConfigError unless the run to adapt, or the published weights, fit the network."""
     run, weights = experiment.adapt.start_from, experiment.model.weights
     if run is not None and run.resolve() == experiment.out.resolve():
         raise ConfigError(f"out is {experiment.out}, the run that adapt.start_from names; choose another --out.")
@@ -189,7 +188,7 @@ def check_start(experiment: Experiment) -> None:
 
 
 def _check_same(saved: Any, asked: Any, out: Path) -> None:
-    """Raise ConfigError where settings that may not change differ."""
+    """Raise ConfigError if settings differ that may not change."""
     before, after = dict(_flatten(saved)), dict(_flatten(asked))
     changed = [key for key in after if before[key] != after[key] and not key.startswith(FREE_TO_CHANGE)]
     if changed:
@@ -198,17 +197,17 @@ def _check_same(saved: Any, asked: Any, out: Path) -> None:
 
 
 def _check_same_network(source: Any, asked: Any, run: Path) -> None:
-    """Raise ConfigError unless the network of a run can be adapted as the one asked for: on the same clips and codec."""
+    """Raise ConfigError unless an adaptation has the network, clips and codec of the run."""
     before, after = dict(_flatten(source)), dict(_flatten(asked))
     compared = [key for key in after if key.startswith(("clip.", "codec.", "model.")) and not key.startswith(FREE_TO_CHANGE)]
     changed = [key for key in compared if before[key] != after[key] and key not in ("model.dtype", "model.weights")]
     if changed:
         differences = "; ".join(f"{key} is {before[key]!r} there, {after[key]!r} here" for key in changed)
-        raise ConfigError(f"the network of {run} cannot be adapted as another one ({differences}); make them agree.")
+        raise ConfigError(f"the network of {run} differs from the config's ({differences}); give both the same settings.")
 
 
 def _flatten(settings: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Name every field of nested settings, as ('train.steps', value)."""
+    """All fields of nested settings, as ('train.steps', value)."""
     for field in dataclasses.fields(settings):
         value = getattr(settings, field.name)
         if dataclasses.is_dataclass(value):
@@ -218,20 +217,20 @@ def _flatten(settings: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def load_run(out: Path) -> tuple[Experiment, Codec]:
-    """Config and codec of a run. Raises ConfigError if the folder lacks them."""
+    """Config and codec of a run. Raises ConfigError if they are missing."""
     experiment = load_run_config(out)
     return experiment, load_run_codec(out, experiment.codec)
 
 
 def load_run_config(out: Path) -> Experiment:
-    """The config that a run was trained with. Raises ConfigError if the folder holds none."""
+    """The config of a run. Raises ConfigError if it is missing."""
     if not (out / "config.yaml").exists():
         raise ConfigError(f"{out} holds no run; train one: python -m xew.model.train CONFIG --out {out}")
     return load_recorded(out / "config.yaml")
 
 
 def load_run_codec(out: Path, settings: CodecSettings) -> Codec:
-    """The codec, of these settings, that a run was trained with. Raises ConfigError if the folder lacks it."""
+    """The codec of a run, with these settings. Raises ConfigError if it is missing."""
     return load_kept_codec(codec_class(settings), out / RUN_CODEC, RUN_REMEDY)
 
 
@@ -241,38 +240,34 @@ class KeptStep:
 
     run: Path
     step: int | None
-    """Step; the latest where None."""
+    """Step; None for the latest."""
     adapt: AdaptSettings
-    """Adaptation of that run; with LoRA the checkpoint holds corrections, else the whole network."""
+    """Adaptation of that run; with LoRA the checkpoint holds corrections, otherwise the whole network."""
 
 
 def trace_run(out: Path, step: int | None = None) -> list[KeptStep]:
-    """The checkpoints that a run's network is the sum of: one of a whole network, then corrections, its own last.
+    """The lineage of checkpoints whose sum is a run's network: a whole network, then LoRA corrections, the run's own last.
 
     Raises:
-        ConfigError: what the run was adapted from has gone or was trained again since, or the note of it is lost.
+        ConfigError: a run that it was adapted from is missing or was trained again, or start.json is missing.
     """
     own = KeptStep(out, step, load_run_config(out).adapt)
     return [*trace_start(out, own.adapt.start_from), own] if own.adapt.lora_rank else [own]
 
 
 def trace_start(out: Path, run: Path | None) -> list[KeptStep]:
-    """The checkpoints that make the network of `run` which the adapted run `out` started from, as noted when it began.
-
-    Raises:
-        ConfigError: they have gone or were trained again since, or a note is lost.
-    """
-    kept: list[KeptStep] = []
+    """The lineage of checkpoints of `run` from which the adapted run `out` started. Raises ConfigError as `trace_run`."""
+    lineage: list[KeptStep] = []
     while run is not None:
-        kept.insert(0, _read_start(out, run))
-        out, adapt = run, kept[0].adapt
+        lineage.insert(0, _read_start(out, run))
+        out, adapt = run, lineage[0].adapt
         run = adapt.start_from if adapt.lora_rank else None
-    return kept
+    return lineage
 
 
 @dataclass(frozen=True)
 class StartNote:
-    """What start.json says."""
+    """Content of start.json."""
 
     run: str
     step: int
@@ -280,7 +275,7 @@ class StartNote:
 
 
 def _read_start(out: Path, run: Path) -> KeptStep:
-    """Read which checkpoint of a run another was adapted from. Raises ConfigError if it has gone, or the note is lost."""
+    """Read from which checkpoint of `run` the run `out` was adapted. Raises ConfigError as `trace_run`."""
     try:
         note = config.parse(StartNote, read_json(out / START), str(out / START))
     except (OSError, ValueError, ConfigError) as error:
@@ -290,7 +285,7 @@ def _read_start(out: Path, run: Path) -> KeptStep:
         ) from error
     if not (run / "config.yaml").exists() or checkpoint_time(run, note.step) != note.saved:
         raise ConfigError(
-            f"{out} was adapted from step {note.step} of {run}, which is not there any more or was trained again; "
-            "put that run back (a longer train.keep_checkpoints keeps it), or adapt again with --overwrite."
+            f"{out} was adapted from step {note.step} of {run}, which no longer exists or was trained again; "
+            "restore that run (a larger train.keep_checkpoints keeps the step), or adapt again with --overwrite."
         )
     return KeptStep(run, note.step, load_run_config(run).adapt)

@@ -1,7 +1,4 @@
-"""What a run folder holds: names of its files and checkpoints, and the file that marks it as a run.
-
-It loads without JAX, for `xew.analysis.study`. folder.py says what each file holds, and reads them.
-"""
+"""Names of a run folder's files and checkpoints; without JAX, for `xew.analysis.study`. folder.py describes the files."""
 
 from pathlib import Path
 
@@ -24,21 +21,21 @@ RUN_FILES = (
     "report.md",
     "pictures/*.png",
 )
-"""Patterns of the paths of what training runs write into their folders."""
+"""Patterns of the paths of a run's files."""
 
 
 def is_run(folder: Path) -> bool:
-    """Whether a training run has made a folder, by its mark."""
+    """Whether a folder has the mark of a run."""
     return (folder / RUN_MARK).is_file()
 
 
 def list_steps(run: Path) -> list[int]:
-    """Steps of the checkpoints of a run, in order."""
+    """Sorted steps of a run's checkpoints."""
     return sorted(int(path.name) for path in (run / "checkpoints").glob("*") if path.name.isdecimal())
 
 
 def checkpoint_time(run: Path, step: int) -> int | None:
-    """Time at which a checkpoint was begun [ns]; another of the same step has another. None if there is no such checkpoint."""
+    """Start time of writing a checkpoint [ns], which identifies it, or None if there is no such checkpoint."""
     try:
         return read_json(run / "checkpoints" / str(step) / "_CHECKPOINT_METADATA")["init_timestamp_nsecs"]
     except (OSError, ValueError, KeyError):

@@ -1,8 +1,7 @@
-"""Training curves and sample videos: TensorBoard event files, and the same numbers as plain metrics.jsonl.
+"""Training curves and sample videos in TensorBoard event files, and the same numbers in metrics.jsonl.
 
-Event files hold the run's config.yaml too, as text and as settings that TensorBoard's HParams page compares runs by.
-
-Only TensorBoard's own writer is used, so that neither TensorFlow nor PyTorch is needed.
+Event files also hold the run's config.yaml, as text and for the HParams page. TensorBoard's own writer needs neither TensorFlow
+nor PyTorch.
 """
 
 import io
@@ -32,7 +31,7 @@ class RunLog:
 
     Args:
         folder: of the run.
-        step: from which the run goes on; what an earlier try has logged of steps after it, and lost, is taken back.
+        step: at which the run continues; log lines of later steps are removed.
     """
 
     def __init__(self, folder: Path, step: int) -> None:
@@ -44,13 +43,13 @@ class RunLog:
             self.events.add_event(Event(wall_time=time.time(), step=step + 1, session_log=SessionLog(status=SessionLog.START)))
         if settings is not None:
             self._settings(step, settings)
-        if before is not None and (kept := _keep_until(before, step)) != before:
-            write_text(path, kept)
+        if before is not None and (earlier := _lines_until(before, step)) != before:
+            write_text(path, earlier)
         self.lines = path.open("a")
 
     def _settings(self, step: int, text: str) -> None:
         """Log a config, given as YAML, as text and as HParams."""
-        page = text_pb("config", "\n".join(f"    {line}" for line in text.splitlines()))  # indented, so that Markdown leaves it
+        page = text_pb("config", "\n".join(f"    {line}" for line in text.splitlines()))  # indented as code in Markdown
         settings = hparams_pb(flatten_settings(yaml.safe_load(text)), start_time_secs=time.time())
         self._add(step, [*page.value, *settings.value])
 
@@ -65,7 +64,7 @@ class RunLog:
         self._add(step, [Summary.Value(tag=name, image=_encode_image([picture], "PNG"))])
 
     def video(self, step: int, name: str, video: np.ndarray) -> None:
-        """Log uint8 [t h w 3] as an animated GIF, which TensorBoard plays among the images."""
+        """Log a video uint8 [t h w 3] as an animated GIF among the images."""
         self._add(step, [Summary.Value(tag=name, image=_encode_image(list(video), "GIF"))])
 
     def close(self) -> None:
@@ -78,7 +77,7 @@ class RunLog:
 
 
 def flatten_settings(content: Any, path: str = "") -> dict[str, bool | float | str]:
-    """Settings of a config by their paths, such as train.steps: numbers, flags and texts, which is all that HParams take."""
+    """Settings of a config by path, such as train.steps, as numbers, flags or text for HParams."""
     if isinstance(content, Mapping):
         parts = (flatten_settings(value, f"{path}.{key}" if path else str(key)) for key, value in content.items())
         return {name: value for part in parts for name, value in part.items()}
@@ -89,13 +88,13 @@ def flatten_settings(content: Any, path: str = "") -> dict[str, bool | float | s
     return {path: float(content) if isinstance(content, int | float) else str(content)}
 
 
-def _keep_until(text: str, step: int) -> str:
-    """Leave out of the text of metrics.jsonl the lines of later steps, and those that were cut off or damaged."""
+def _lines_until(text: str, step: int) -> str:
+    """The whole lines of metrics.jsonl up to a step."""
     return "".join(line for line in text.splitlines(keepends=True) if line.endswith("\n") and _step_of(line) <= step)
 
 
 def _step_of(line: str) -> float:
-    """The step of a line; infinity where it cannot be read."""
+    """The step of a line; infinity if it cannot be read."""
     try:
         step = json.loads(line)["step"]
     except (ValueError, KeyError, TypeError, RecursionError):

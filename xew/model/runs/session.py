@@ -1,4 +1,4 @@
-"""The open files of a run that is being trained: its checkpoints and its log."""
+"""The open files of a run in training: its checkpoints and its log."""
 
 import contextlib
 from collections.abc import Iterator
@@ -20,17 +20,17 @@ class Session:
     """Folder of the run."""
     checkpoints: Any
     log: RunLog | None
-    """None on all processes but the first."""
+    """Log of the first process; None in others."""
 
     @property
     def step(self) -> int:
-        """Step of the latest checkpoint; 0 of a new run."""
+        """Step of the latest checkpoint, or 0."""
         return self.checkpoints.latest_step() or 0
 
 
 @contextlib.contextmanager
 def open_session(out: Path, keep: int) -> Iterator[Session]:
-    """Open the log and the checkpoints of a run, so many of which are kept; all is written when the block ends."""
+    """Open the log and the checkpoints of a run, of which the last `keep` are kept; all is written when the block ends."""
     with write_checkpoints(out, keep) as checkpoints:
         log = RunLog(out, checkpoints.latest_step() or 0) if jax.process_index() == 0 else None
         try:

@@ -1,11 +1,10 @@
-"""Predicting: a trained network continues episodes from their first frame and their commands.
+"""Autoregressive prediction: a trained network continues episodes from their first frame and their commands.
 
 Reads  episodes (first frame, instruction, commands)
 Writes uint8 video at the model's size
 
-Long episodes are predicted in chunks; the last predicted frame of one is the reference of the next, and the noise of each
-depends on the seed, the episode and the chunk. A batch of episodes is cut over the devices of the mesh that the parameters
-lie on, and every chunk runs on them from frames to frames.
+Long episodes are predicted in chunks; the last frame of a chunk is the reference of the next. The noise depends on the seed,
+the episode and the chunk. Batches are sharded over the mesh of the parameters.
 """
 
 import functools
@@ -45,22 +44,22 @@ Streams = dict[str, np.ndarray]
 
 
 class ChunkInputs(NamedTuple):
-    """What the network is given for one chunk of each episode of a batch."""
+    """Input of the network for one chunk of each episode of a batch."""
 
     reference: Array
-    """[b 1 h w 3] uint8, the frame that the chunk continues."""
+    """[b 1 h w 3] uint8, first frame of the chunk."""
     conditions: Mapping[str, Array]
     """Stream or mechanism -> [b t' h' w' c] latents or [b t' n] numbers, scaled."""
     text: Array
     """[b l e] or [b l]."""
     negative: Array | None
-    """The same of the negative prompt, where there is guidance."""
+    """The same of the negative prompt, or None without guidance."""
     keys: Array
-    """[b 2] uint32, data of random keys, of the episode and the chunk."""
+    """[b 2] uint32, data of random keys."""
 
 
 class ChunkSampling(NamedTuple):
-    """How a chunk is sampled; hashable, static in the compiled function."""
+    """Sampler settings; hashable, static in the compiled function."""
 
     sampler: str
     schedule: NoiseSchedule
@@ -69,10 +68,10 @@ class ChunkSampling(NamedTuple):
 
 
 class Prediction(NamedTuple):
-    """A prediction that the devices may still be working on."""
+    """A prediction, perhaps still being computed."""
 
     chunks: list[Array]
-    """Chunks of frames [b t h w 3] uint8; each begins with the last frame of the one before."""
+    """Chunks of frames [b t h w 3] uint8; each begins with the last frame of the previous one."""
     episodes: int
     frame_count: int
 
@@ -93,62 +92,61 @@ class Predictor:
     codec: Codec
     graph: nnx.GraphDef
     params: Any
-    """Parameters on one device, or on the devices of a mesh (`xew.model.devices.sharding`), over which batches are cut."""
+    """Parameters on one device, or on a mesh (`xew.model.devices.sharding`), over which batches are sharded."""
     scales: Mapping[str, Scale] = field(default_factory=dict)
-    """Normalization of conditions that are numbers, as in training."""
+    """Scales of numeric conditions, as in training."""
 
     def predict(self, episodes: Sequence[Episode], frame_count: int) -> np.ndarray:
-        """The first `frame_count` frames of each episode, predicted from its first: uint8 [b t h w 3] at the model's size.
+        """Predict the first `frame_count` frames of each episode: uint8 [b t h w 3] at the model's size.
 
-        Frame 0 is the codec's view of the given one. The noise depends on the episode and the chunk, not on the batch.
+        Frame 0 is the codec's reconstruction of the first frame. Results do not depend on the batch.
         """
         return self.begin(episodes, frame_count).fetch()
 
     def begin(self, episodes: Sequence[Episode], frame_count: int, batch: int = 1) -> Prediction:
-        """Read what `predict` needs and set the devices to work, without waiting for them.
+        """Start `predict` without waiting for the devices.
 
-        Fewer episodes than `batch` are filled up by repeating the last, so that nothing is compiled for a smaller batch; so
-        are those that do not cover the devices evenly.
+        The last episode is repeated to fill `batch` and the devices, so no smaller batch is compiled.
         """
-        filled = max(len(episodes), batch)
-        filled += -filled % self._devices
-        whole = [*episodes, *[episodes[-1]] * (filled - len(episodes))]
+        size = max(len(episodes), batch)
+        size += -size % self._devices
+        padded = [*episodes, *[episodes[-1]] * (size - len(episodes))]
         streams = list(map_in_order(self._read, episodes))
-        streams += streams[-1:] * (filled - len(episodes))
-        text, negative = self._encode_text(whole)
-        given = self._place(np.stack([stream["rgb"] for stream in streams]))
+        streams += streams[-1:] * (size - len(episodes))
+        text, negative = self._encode_text(padded)
+        first = self._place(np.stack([stream["rgb"] for stream in streams]))
         unaligned = self._encode_unaligned(streams)
         sampling = ChunkSampling(self.settings.sampler, self.schedule, self.settings.guidance, self.inputs.latent_shape)
         chunks: list[Array] = []
         for number, start in enumerate(range(0, max(frame_count - 1, 1), self.inputs.clip.frames - 1)):
-            conditions = unaligned | self._encode_history(given, chunks, start) | self._encode_conditions(streams, start)
-            keys = self._place(np.stack([self._key(episode, number) for episode in whole]))
-            reference = chunks[-1][:, -1:] if chunks else given
+            conditions = unaligned | self._encode_history(first, chunks, start) | self._encode_conditions(streams, start)
+            keys = self._place(np.stack([self._key(episode, number) for episode in padded]))
+            reference = chunks[-1][:, -1:] if chunks else first
             inputs = ChunkInputs(reference, conditions, text, negative, keys)
             with jax.set_mesh(self._mesh) if self._mesh is not None else nullcontext():
                 chunks.append(predict_chunk(self.graph, self.params, self.codec, inputs, sampling))
         return Prediction(chunks, len(episodes), frame_count)
 
     def _read(self, episode: Episode) -> Streams:
-        """The first frame of an episode, and all of its conditions."""
+        """The first frame of an episode, and its conditions."""
         inputs, (folder, _) = self.inputs, episode
-        made = [name for name, condition in inputs.conditions.items() if condition.make is not None]
+        names = [name for name, condition in inputs.conditions.items() if condition.make is not None]
         first = to_model_size(read_video(folder / "rgb.mkv", most=1), inputs.clip.height, inputs.clip.width)
-        return {"rgb": first} | read_streams(inputs.conditions, inputs.clip, *episode, made)
+        return {"rgb": first} | read_streams(inputs.conditions, inputs.clip, *episode, names)
 
     def _encode_text(self, episodes: Sequence[Episode]) -> tuple[Any, Any]:
-        """Encode the instructions and, where there is guidance, as many negative prompts."""
+        """Encode the instructions and, with guidance, as many negative prompts."""
         settings = self.settings
-        spoken = [record.instruction for _, record in episodes]
-        encoded = self.instructions.encode(spoken)
-        text = self._place(np.stack([encoded[instruction] for instruction in spoken]))
+        instructions = [record.instruction for _, record in episodes]
+        encoded = self.instructions.encode(instructions)
+        text = self._place(np.stack([encoded[instruction] for instruction in instructions]))
         if settings.guidance == 1:
             return text, None
         negative = self.instructions.encode([settings.negative_prompt])[settings.negative_prompt]
         return text, self._place(np.stack([negative] * len(episodes)))
 
     def _encode_unaligned(self, streams: Sequence[Streams]) -> dict[str, Array]:
-        """Encode the pictures that say the same of every chunk."""
+        """Encode the pictures that every chunk reuses."""
         return {
             name: encode_pictures(self.codec, self._place(np.stack([stream[name] for stream in streams])))
             for name, condition in self.inputs.conditions.items()
@@ -156,7 +154,7 @@ class Predictor:
         }
 
     def _encode_conditions(self, streams: Sequence[Streams], start: int) -> dict[str, Array]:
-        """Encode what conditions say of the chunk that begins at frame `start`; past the end the last frame stays."""
+        """Encode aligned conditions of the chunk that begins at frame `start`."""
         frames, history = self.inputs.clip.frames, self.inputs.history
         pictures, numbers = {}, {}
         for name, condition in self.inputs.conditions.items():
@@ -168,12 +166,12 @@ class Predictor:
         scaled = apply_scales(self.scales, self.inputs.conditions, numbers)
         return pictures | {name: self._place(array) for name, array in scaled.items()}
 
-    def _encode_history(self, given: Array, chunks: Sequence[Array], start: int) -> dict[str, Array]:
-        """Encode earlier frames one by one: the model's own predictions, since the recorded ones would show the future."""
+    def _encode_history(self, first: Array, chunks: Sequence[Array], start: int) -> dict[str, Array]:
+        """Encode earlier frames of the prediction one by one."""
         names = [name for name, condition in self.inputs.conditions.items() if condition.make is None]
         if not names:
             return {}
-        past = jnp.concatenate([given, *(chunk[:, 1:] for chunk in chunks)], axis=1)
+        past = jnp.concatenate([first, *(chunk[:, 1:] for chunk in chunks)], axis=1)
         earlier = np.maximum(start + np.asarray(self.inputs.history), 0)
         encoded = [encode_pictures(self.codec, past[:, frame : frame + 1]) for frame in earlier]
         return dict.fromkeys(names, jnp.concatenate(encoded, axis=1))
@@ -192,7 +190,7 @@ class Predictor:
 
     @property
     def _devices(self) -> int:
-        """Number of devices over which a batch is cut. Of several processes each has it whole, so that each gets all frames."""
+        """Number of devices over which a batch is sharded. With several processes each holds the whole batch."""
         return math.prod(self._mesh.devices.shape) if self._mesh is not None and jax.process_count() == 1 else 1
 
     def _place(self, array: Any) -> Any:
@@ -203,14 +201,14 @@ class Predictor:
 
 
 def make_predictor(experiment: Experiment, codec: Codec, params: Any, scales: Mapping[str, Scale]) -> Predictor:
-    """The model of an experiment with these parameters, sampled as its config says; the rest as of `Predictor`."""
+    """The predictor of an experiment with these parameters."""
     graph, settings = network_graph(experiment.network.for_sampling), experiment.rollout
     return Predictor(experiment.inputs, experiment.instructions, settings, experiment.schedule, codec, graph, params, scales)
 
 
 @functools.partial(jax.jit, static_argnums=(0, 4))
 def predict_chunk(graph: nnx.GraphDef, params: Any, codec: Any, inputs: ChunkInputs, sampling: ChunkSampling) -> Array:
-    """Predict one chunk of every episode of a batch, from its reference on: uint8 [b t h w 3]."""
+    """Predict one chunk of every episode of a batch: uint8 [b t h w 3]."""
     model = nnx.merge(graph, cast_params(graph, params))
     reference = codec.encode_batch(to_signed(inputs.reference))
     keys = jax.random.wrap_key_data(inputs.keys)
@@ -221,7 +219,7 @@ def predict_chunk(graph: nnx.GraphDef, params: Any, codec: Any, inputs: ChunkInp
 
 
 def guided_velocity(model: WorldModel, inputs: ChunkInputs, guidance: float) -> Callable[[Array, Array], Array]:
-    """Make the network's velocity as a function of latents and noise level; with guidance away from the negative prompt's."""
+    """Make the network's velocity, with guidance if there is a negative prompt, as a function of latents and noise level."""
     wanted = _make_velocity(model, inputs.conditions, inputs.text)
     if inputs.negative is None:
         return wanted
@@ -235,9 +233,7 @@ def guided_velocity(model: WorldModel, inputs: ChunkInputs, guidance: float) -> 
 
 
 def _make_velocity(model: WorldModel, conditions: Mapping[str, Array], text: Array) -> Callable[[Array, Array], Array]:
-    """Condition tokens that do not see RGB's are computed here, once a chunk."""
-    once = model.one_way and model.condition_streams
-    cache = model.condition_cache(conditions, text) if once else None
+    cache = model.condition_cache(conditions, text) if model.one_way and model.condition_streams else None
     return lambda latents, level: model(latents, conditions, level, text, cache)
 
 

@@ -1,6 +1,6 @@
-"""Settings of an experiment: what a config may hold, what it must not, and the parts that the rest of the package takes.
+"""Settings of an experiment: the sections of a config, their checks, and the parts that the rest of the package takes.
 
-`xew.model.experiment` puts them together; nothing here reads a file.
+`xew.model.experiment` combines them.
 """
 
 __all__ = ["checks", "optimizer", "parts", "settings"]

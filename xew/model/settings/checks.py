@@ -1,4 +1,4 @@
-"""Checks of an experiment: a number or choice that cannot be used is an error before anything is done with it."""
+"""Checks of an experiment's settings, before any work starts."""
 
 from collections.abc import Mapping, Sequence
 from operator import attrgetter
@@ -26,7 +26,7 @@ LEAST_OF_STEPS: dict[str, float] = {
     "train.sample_every": 0,
     "train.keep_checkpoints": 1,
 }
-"""Least values of the settings of any training run, of a world model or a codec."""
+"""Least values of the settings of a training run, of a world model or a codec."""
 LEAST = LEAST_OF_STEPS | {
     "clip.height": 1,
     "clip.width": 1,
@@ -44,11 +44,11 @@ LEAST = LEAST_OF_STEPS | {
 }
 """Least values of an experiment's settings."""
 LONGEST_AVERAGE = 0.25
-"""Largest `train.ema`: an average of a longer reach would still hold the random start (2 % of it at this one)."""
+"""Largest `train.ema`; a longer average would hold more than 2 % of the random start."""
 
 
 def check_experiment(experiment: Any, source: str) -> None:
-    """Raise ConfigError, naming the source, with a choice of an experiment that does not exist or does not fit."""
+    """Raise ConfigError, naming the source, for a setting that does not exist or does not fit."""
     try:
         _check_choices(experiment, source)
     except ConfigError as error:
@@ -70,7 +70,7 @@ def _check_choices(experiment: Any, source: str) -> None:
 
 
 def check_least(least: Mapping[str, float], settings: Any, source: str) -> None:
-    """Raise ConfigError where a number of some settings, named as "train.batch", is under the least that it may be."""
+    """Raise ConfigError if a number of some settings, named as "train.batch", is below its least value."""
     for name, smallest in least.items():
         value = attrgetter(name)(settings)
         if not value >= smallest:
@@ -80,7 +80,7 @@ def check_least(least: Mapping[str, float], settings: Any, source: str) -> None:
 def check_steps(steps: int, length: float, unit: str, source: str) -> None:
     """Raise ConfigError unless a training run has one length, in steps or in another unit."""
     if (steps > 0) == (length > 0):
-        raise ConfigError(f"{source}: train.steps is {steps}, train.{unit} {length:g}; give one of them, and 0 for the other.")
+        raise ConfigError(f"{source}: train.steps is {steps}, train.{unit} {length:g}; set one of them, and the other to 0.")
 
 
 def _check_conditions(conditions: Sequence[Condition], source: str) -> None:
@@ -90,7 +90,7 @@ def _check_conditions(conditions: Sequence[Condition], source: str) -> None:
     for condition in conditions:
         if condition.stream not in known:
             raise ConfigError(
-                f"{source}: the condition {condition.name} feeds {condition.stream!r}; conditions feed {', '.join(known)}."
+                f"{source}: the condition {condition.name} feeds {condition.stream!r}; expected one of {', '.join(known)}."
             )
         if condition.stream in feeders:
             raise ConfigError(
@@ -106,8 +106,8 @@ def _check_sizes(experiment: Any, source: str) -> None:
         near = max(5, clip.frames // TEMPORAL_FACTOR * TEMPORAL_FACTOR + 1)
         raise ConfigError(f"{source}: clip.frames is {clip.frames}; it must be 4 k + 1 and at least 5, for example {near}.")
     if clip.height % factor or clip.width % factor:
-        found = f"clip is {clip.width}x{clip.height}"
-        raise ConfigError(f"{source}: {found}; both sides must be multiples of {factor} (codec factor x patch).")
+        size = f"{clip.width}x{clip.height}"
+        raise ConfigError(f"{source}: clip is {size}; both sides must be multiples of {factor} (codec factor x patch).")
 
 
 def _check_training(experiment: Any, source: str) -> None:
@@ -119,24 +119,25 @@ def _check_training(experiment: Any, source: str) -> None:
         raise ConfigError(f"{source}: train.shift is {train.shift:g}; it must be over 0 (1 leaves the levels as they are).")
     if adapt.start_from is None:
         if adapt != AdaptSettings():
-            raise ConfigError(f"{source}: adapt says how, but adapt.start_from not which run to adapt; give that, or no adapt.")
+            raise ConfigError(f"{source}: adapt is set without adapt.start_from; set it to the run to adapt, or remove adapt.")
         return
     if not adapt.robots or adapt.episodes < 1:
-        raise ConfigError(f"{source}: adapt needs the robots to adapt to and at least one episode of each task and robot.")
+        raise ConfigError(f"{source}: adapt needs adapt.robots and at least one of adapt.episodes of each task and robot.")
     if not 0 <= adapt.replay < 1 or (adapt.replay and count_replayed(train.batch, adapt.replay) >= train.batch):
         raise ConfigError(
-            f"{source}: adapt.replay is {adapt.replay:g} of a batch of {train.batch}; it is a part that leaves room for others."
+            f"{source}: adapt.replay is {adapt.replay:g} of a batch of {train.batch}; it must be a part below 1 that leaves at "
+            "least one other sample."
         )
 
 
 def _check_history(settings: ModelSettings, conditions: Sequence[Condition], source: str) -> None:
     if any(frame >= 0 for frame in settings.history) or list(settings.history) != sorted(settings.history):
-        found = f"{source}: model.history is {list(settings.history)}"
-        raise ConfigError(f"{found}; give frames before the clip, the earliest first, as [-40, -20].")
+        history = list(settings.history)
+        raise ConfigError(f"{source}: model.history is {history}; expected negative frames, the earliest first, as [-40, -20].")
     streams = [condition.stream for condition in conditions]
     framed = [name for name in streams if name in MECHANISMS and MECHANISMS[name].enters == "frame"]
     if settings.visibility == "one_way" and framed and settings.history:
         raise ConfigError(
-            f"{source}: model.visibility one_way computes earlier frames without the poses that action {settings.action} gives "
-            "them; use joint, or leave model.history out."
+            f"{source}: model.visibility one_way computes earlier frames without the poses of action {settings.action}; use "
+            "joint, or set model.history to []."
         )

@@ -1,4 +1,4 @@
-"""The optimizer: AdamW with clipping, as in the paper (its section on optimization), or Muon; and the number of steps."""
+"""The optimizer (AdamW with clipping as in the paper's section on optimization, or Muon) and the number of steps."""
 
 import math
 from dataclasses import replace
@@ -20,7 +20,7 @@ CLIP_NORM = 1.0
 
 
 def learning_rate(settings: TrainSettings) -> optax.Schedule:
-    """Make the schedule, step -> learning rate: optional warm-up, then constant or decaying by a cosine."""
+    """Learning-rate schedule: optional warm-up, then constant or cosine decay."""
     decaying = max(settings.steps - settings.warmup_steps, 1)
     decay = optax.cosine_decay_schedule(settings.learning_rate, decaying, alpha=settings.decay_to)
     schedule = optax.constant_schedule(settings.learning_rate) if settings.decay_to == 1 else decay
@@ -31,15 +31,14 @@ def learning_rate(settings: TrainSettings) -> optax.Schedule:
 
 
 RMS_OF_ADAM = 0.2
-"""Root mean square to which Muon's updates are scaled, that of AdamW's: one learning rate then serves both (Moonlight, Liu et
-al. 2025, arXiv:2502.16982, equation 4)."""
+"""Root mean square of Muon's updates, as of AdamW's, so both use one learning rate (Moonlight, Liu et al. 2025,
+arXiv:2502.16982, equation 4)."""
 
 
 def make_optimizer(settings: TrainSettings) -> optax.GradientTransformation:
     """Make the optimizer of `train.optimizer` after clipping by the global norm; the first moments are in `mu_dtype`.
 
-    Muon makes its updates orthogonal in that type too, in bfloat16 as its author does (Jordan 2024): the products take less
-    time, and their error is small compared with that of the iteration itself, which ends long before it converges.
+    Muon orthogonalizes its updates in that type too; its author uses bfloat16 (Jordan 2024).
     """
     rate, mu_dtype = learning_rate(settings), jnp.dtype(settings.mu_dtype)
     if settings.optimizer == "muon":
@@ -59,7 +58,7 @@ def make_optimizer(settings: TrainSettings) -> optax.GradientTransformation:
 
 
 def round_matrices(dtype: DTypeLike) -> optax.GradientTransformation:
-    """Bring the gradients of `find_matrices` to a type: optax's Muon computes in the type of its gradients and moments."""
+    """Cast the gradients of `find_matrices`, because optax's Muon computes in the type of its gradients and moments."""
 
     def rounded(updates: Any, params: Any) -> Any:
         axes = find_matrices(updates)
@@ -69,9 +68,9 @@ def round_matrices(dtype: DTypeLike) -> optax.GradientTransformation:
 
 
 def find_matrices(params: Any) -> Any:
-    """The tree of parameters with their axes for Muon where they are the blocks' stacked matrices [layers in out], else None.
+    """Axes for Muon of the blocks' stacked matrices [layers in out] in the tree of parameters, None for AdamW's parameters.
 
-    Embeddings, the head, norms and modulations are AdamW's, as Muon's author has it (Jordan 2024).
+    AdamW optimizes embeddings, the head, norms and modulations, as Muon's author advises (Jordan 2024).
     """
 
     def axes(path: tuple[Any, ...], leaf: Any) -> MuonDimensionNumbers | None:
@@ -83,12 +82,12 @@ def find_matrices(params: Any) -> Any:
 
 
 def average_decay(settings: TrainSettings) -> float:
-    """Decay of the moving average whose reach is the fraction `train.ema` of the run's steps."""
+    """Decay of the moving average over the fraction `train.ema` of the run's steps."""
     return 1 - 1 / max(settings.ema * settings.steps, 1)
 
 
 def set_steps(settings: TrainSettings, samples: int, replay: float = 0.0) -> TrainSettings:
-    """The same settings with `steps` set to their `epochs` passes over `samples` new (not replayed) samples."""
+    """The settings with `steps` set to `epochs` passes over `samples` new (not replayed) samples."""
     if not settings.epochs:
         return settings
     fresh = settings.batch - count_replayed(settings.batch, replay)

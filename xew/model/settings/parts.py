@@ -1,4 +1,4 @@
-"""The parts that an experiment is resolved into, each for one place that takes it."""
+"""The parts of an experiment."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
@@ -20,24 +20,22 @@ from xew.protocol import SHARED_MOTION, Split, validation_split
 
 @dataclass(frozen=True)
 class ClipInputs:
-    """What the network is given of a clip: how it is cut, and which conditions go with it."""
+    """The network's inputs of a clip."""
 
     clip: Clip
     chunks: int
-    """Consecutive clips of a training sample."""
+    """Number of consecutive clips in a training sample."""
     history: tuple[int, ...]
-    """Earlier frames, counted from the clip's first."""
+    """Earlier frames, relative to the clip's first."""
     conditions: dict[str, Condition]
-    """Conditions by the stream or mechanism that each feeds; `.name` is a condition's name in the cache."""
+    """Conditions by stream or mechanism."""
     shapes: dict[str, tuple[int, ...]]
-    """Shapes of a clip's arrays by stream or mechanism, rgb and text included: latents [t h w c], numbers [t n], text [l e] or
-    [l]."""
+    """Shapes of a clip's arrays by stream or mechanism: latents [t h w c], numbers [t n], text [l e] or [l]."""
     patch: Patch
-    """Latent frames, rows and columns of a token of the network."""
 
     @property
     def latent_shape(self) -> tuple[int, ...]:
-        """Shape [t h w c] of one RGB clip."""
+        """Shape [t h w c] of a clip's RGB latents."""
         return self.shapes["rgb"]
 
     @property
@@ -49,72 +47,71 @@ class ClipInputs:
 
 @dataclass(frozen=True)
 class Encoding:
-    """How episodes become latents, and where these are kept: everything that the latent cache depends on."""
+    """Everything on which the latent cache depends."""
 
     inputs: ClipInputs
     codec: CodecSettings
     kind: type[Codec]
-    """Class of codec that the settings name."""
+    """Class of the codec."""
     folder: Path
+    """Folder of the cache."""
     data: Path
     start_from: Path | None
-    """Run whose codec and scales are used, in an adaptation."""
+    """Run of an adaptation, whose codec and scales are used."""
     autoencoder: VaeSize | None = None
-    """Size of the video autoencoder, where the codec is one."""
+    """Size of the codec wan_vae."""
 
     @property
     def remedy(self) -> str:
-        """What to do where the cache lacks something."""
-        return f"run `python -m xew.model.latents CONFIG --data {self.data}`, with the other choices of this command too"
+        """Remedy for an incomplete cache."""
+        return f"run `python -m xew.model.latents CONFIG --data {self.data}`, with the other options of this command too"
 
 
 @dataclass(frozen=True)
 class EpisodeChoice:
-    """Which episodes of a data set a training run reads; every robot by its own key."""
+    """Selection of a training run's episodes."""
 
     robots: tuple[str, ...]
-    """Robots whose training episodes are learned from."""
+    """Training robots."""
     shots: int = 0
-    """Number of episodes of each task and robot in an adaptation, which needs them of all robots; 0 takes all there are."""
+    """Number of episodes of each task and robot in an adaptation; 0 takes all."""
     replay: tuple[str, ...] = ()
-    """Robots whose training episodes are replayed, in an adaptation with replay."""
+    """Replayed robots of an adaptation."""
     samples: Mapping[str, str] = field(default_factory=dict)
-    """Roles of the robots that sample videos are drawn of: seen, unseen or target."""
+    """Roles (seen, unseen or target) of the robots in sample videos."""
     motion: str = SHARED_MOTION
-    """Kind of motion of the episodes, as the split names it."""
+    """Kind of motion, as in the split."""
 
 
 @dataclass(frozen=True)
 class TrainSpec:
-    """What a run trains and how: the network, its inputs, and the settings of optimizer and loss."""
+    """Specification of a training run: the network, its inputs, and the settings of optimizer and loss."""
 
     network: Network
     inputs: ClipInputs
     settings: TrainSettings
-    """With `steps` once the number of samples is known, see `with_steps`."""
     replay: float = 0.0
-    """Part of every batch that is replayed, in an adaptation."""
+    """Replayed part of every batch of an adaptation."""
     lora_rank: int = 0
-    """Rank of the corrections that are learned; 0 learns all weights."""
+    """Rank of the LoRA corrections; 0 trains all weights."""
 
     @property
     def optimizer(self) -> optax.GradientTransformation:
-        """Optimizer of these settings."""
         return make_optimizer(self.settings)
 
     def with_steps(self, samples: int) -> "TrainSpec":
-        """The same with the length of the run in steps, for so many new (not replayed) training samples."""
+        """The same with `steps` set for this number of new (not replayed) training samples."""
         return replace(self, settings=set_steps(self.settings, samples, self.replay))
 
 
 def pick_conditions(settings: ModelSettings) -> list[Condition]:
-    """Look up the conditions of action, embodiment and history. Raises ConfigError for a name that does not exist."""
+    """Look up the conditions of action, embodiment and history. Raises ConfigError for an unknown name."""
     action, embodiment = pick(ACTIONS, settings.action, "action", (tuple,)), pick(CONDITIONS, settings.embodiment, "embodiment")
     return [*list_conditions(action), *list_conditions(embodiment), *([HISTORY] if settings.history else [])]
 
 
 def sample_roles(split: Split, targets: Iterable[str] = ()) -> dict[str, str]:
-    """Roles of the robots that samples are drawn of: those that choices are made by (`validation_split`), and targets."""
+    """Roles of the robots in sample videos: the validation split's, and targets."""
     chosen = validation_split(split)
     roles = dict.fromkeys(chosen.train_robots, "seen") | dict.fromkeys(chosen.held_out_robots, "unseen")
     return roles | dict.fromkeys(targets, "target")

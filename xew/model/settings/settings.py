@@ -1,4 +1,4 @@
-"""What the sections of configs/*.yaml hold. The defaults are the recommended recipe, that of configs/fixed.yaml."""
+"""The sections of configs/*.yaml. The defaults are the recommended recipe of configs/fixed.yaml."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,38 +9,38 @@ from xew.model.network.spec import NetworkSettings
 
 @dataclass(frozen=True)
 class Clip:
-    """What the model sees at once."""
+    """Size of the clips that the model predicts at once."""
 
     frames: int = 33
-    """Number of frames, 4 k + 1; the first is given, the others are predicted."""
+    """Number of frames, 4 k + 1, including the given first frame."""
     height: int = 256
-    """Height [pixels]; the camera's 320x240 is padded to this aspect ratio, then resized."""
+    """Height [pixels]; the camera's 320x240 is padded to the clip's aspect ratio, then resized."""
     width: int = 320
 
 
 @dataclass(frozen=True)
 class ModelSettings(NetworkSettings):
-    """The network, what it is conditioned on, and the weights that it starts from."""
+    """The network, its conditions and initial weights."""
 
     size: str = "small"
     """One of MODELS."""
     action: str = "mask_and_flow_channels"
-    """One of ACTIONS: the form in which the network is given the commanded motion."""
+    """Representation of the commanded motion, one of ACTIONS."""
     embodiment: str = "pasted_render"
-    """One of CONDITIONS: the form in which the network is given the robot's appearance."""
+    """Representation of the robot's appearance, one of CONDITIONS."""
     reference: Literal["frame", "channels"] = "channels"
-    """Place of the clip's first frame: latent frame 0 alone, as in Wan, or the channels of every latent frame too, as in
+    """Input of the clip's first frame: latent frame 0 alone, as in Wan, or the channels of every latent frame too, as in
     Ctrl-World (arXiv 2510.10125)."""
     text: str = "learned"
-    """One of TEXT_ENCODERS: a table of words that the network learns, or Wan's frozen encoder."""
+    """One of TEXT_ENCODERS: a learned table of words, or Wan's frozen encoder."""
     text_weights: Path | None = None
-    """umt5: models_t5_umt5-xxl-enc-bf16.pth, or the text_encoder folder of the diffusers layout."""
+    """Weights of umt5: models_t5_umt5-xxl-enc-bf16.pth, or diffusers' text_encoder folder."""
     text_tokenizer: Path | None = None
-    """umt5: the folder google/umt5-xxl, or the tokenizer folder of the diffusers layout."""
+    """Tokenizer of umt5: the folder google/umt5-xxl, or diffusers' tokenizer folder."""
     text_prefix: str = ""
-    """Text put before every instruction, as FlowWAM's published weights expect it."""
+    """Prefix of every instruction, as FlowWAM's published weights expect it."""
     weights: Path | None = None
-    """Published weights to start from: official Wan, diffusers, FlowWAM (dit_layouts.load_dit); from scratch if left out."""
+    """Published weights to start from: official Wan, diffusers or FlowWAM (default: from scratch)."""
 
 
 @dataclass(frozen=True)
@@ -48,55 +48,55 @@ class TrainSettings:
     batch: int = 4
     """Number of samples of a step, over all devices."""
     steps: int = 7500
-    """Number of steps; 0 where `epochs` gives the length."""
+    """Number of steps; 0 if `epochs` sets the length."""
     epochs: float = 0.0
-    """Passes over the training samples; give this or `steps`."""
+    """Number of passes over the training samples; 0 if `steps` sets the length."""
     seed: int = 0
     optimizer: Literal["adamw", "muon"] = "muon"
     """AdamW as in the paper, or Muon for the matrices of the blocks and AdamW for the rest."""
     learning_rate: float = 2e-3
     """Peak of the learning rate."""
     warmup_steps: int = 100
-    """Number of steps in which the learning rate rises to its peak."""
+    """Number of steps of linear warm-up."""
     decay_to: float = 0.05
-    """Cosine decay of the learning rate to this part of its peak at the end; 1 keeps it constant."""
+    """Final learning rate of the cosine decay relative to its peak; 1 keeps it constant."""
     ema: float = 0.1
-    """Reach of the exponential moving average of the parameters, as a fraction of the run's steps; 0 keeps none. Samples and
-    rollouts use the average."""
+    """Reach of the exponential moving average of the parameters, for samples and rollouts, as a fraction of the run's steps; 0
+    disables it."""
     motion_loss_weight: float = 4.0
-    """Places that differ from the clip's first frame weigh up to 1 + this times as much in the loss; 0 weighs all alike."""
+    """Additional weight, up to this, in the loss of positions that differ from the clip's first frame."""
     shift: float = 5.0
-    """Shift of the noise levels, in training and in sampling."""
+    """Shift of the noise levels in training and sampling."""
     history_noise: float = 0.0
-    """Standard deviation of what is added to earlier frames' latents in training; Ctrl-World has 0.3."""
+    """Standard deviation of the noise on earlier frames' latents in training; 0.3 in Ctrl-World."""
     chunks: Literal[1, 2] = 1
-    """Consecutive clips of a sample; the second starts from the predicted, not the true, end of the first."""
+    """Number of consecutive clips in a sample; the second starts from the predicted end of the first."""
     accumulate: int = 1
-    """Parts of the batch that are computed one after another: less memory, the same step."""
+    """Number of sequential parts of a batch (gradient accumulation), to save memory."""
     mu_dtype: Literal["float32", "bfloat16"] = "float32"
-    """Type of the optimizer's first moment, and of what Muon makes orthogonal; bfloat16 saves two bytes a parameter, and
-    some of the time of Muon's products (docs/performance.md)."""
+    """Type of the optimizer's first moment and of Muon's orthogonalization; bfloat16 saves memory and time
+    (docs/performance.md)."""
     log_every: int = 50
     save_every: int = 2500
     sample_every: int = 0
-    """Number of steps between sample videos in TensorBoard; 0 draws none."""
+    """Number of steps between sample videos in TensorBoard; 0 disables them."""
     keep_checkpoints: int = 2
 
 
 @dataclass(frozen=True)
 class AdaptSettings:
-    """Adaptation of a trained run to robots that it has not seen, from a few episodes. Off without `start_from`."""
+    """Few-shot adaptation of a run to unseen robots; off without `start_from`."""
 
     start_from: Path | None = None
-    """The run whose weights, at its latest checkpoint, are the start."""
+    """The run to adapt, from its latest checkpoint."""
     robots: tuple[str, ...] = ()
-    """Robots whose episodes are learned from."""
+    """Target robots."""
     episodes: int = 1
-    """Number of episodes of each task and robot, those of the first accepted training seeds (M in the paper)."""
+    """Number of episodes of each task and robot, from the first accepted training seeds (M in the paper)."""
     replay: float = 0.0
-    """Part of every batch that comes from the run's own training robots; 0 as in the paper."""
+    """Part of every batch from the run's training robots; 0 as in the paper."""
     lora_rank: int = 0
-    """Rank of the LoRA corrections that are learned instead of all weights; 0, as in the paper, learns all weights."""
+    """Rank of LoRA corrections; 0, as in the paper, trains all weights."""
 
 
 @dataclass(frozen=True)
@@ -104,20 +104,20 @@ class RolloutSettings:
     sampler: str = "unipc"
     """One of SAMPLERS."""
     noise_schedule: str = "flowwam"
-    """One of SCHEDULES, each by the name of the project that has it."""
+    """One of SCHEDULES, which are named after projects."""
     steps: int = 8
-    """Number of evaluations of the network a chunk."""
+    """Number of network evaluations for each chunk."""
     guidance: float = 1.0
-    """Classifier-free guidance against `negative_prompt`; 1 is none and costs nothing. Wan's own sampling has 5; networks
-    trained here have never gone without their instruction."""
+    """Classifier-free guidance against `negative_prompt`; 1 disables it. Wan uses 5, but xew trains without dropping
+    instructions."""
     negative_prompt: str = ""
     batch: int = 15
-    """Number of episodes at once over all devices."""
+    """Number of episodes at once, over all devices."""
     max_frames: int = 0
-    """Number of frames of an episode that are predicted, from its first; 0 predicts all."""
+    """Number of frames to predict of each episode; 0 predicts all."""
     seed: int = 0
 
 
 def count_replayed(batch: int, replay: float) -> int:
-    """Number of samples of a batch that are replayed: the nearest whole one, at least one where any are asked for."""
+    """Number of replayed samples of a batch: the nearest integer, at least one if `replay` is positive."""
     return max(1, round(batch * replay)) if replay else 0

@@ -1,3 +1,3 @@
-"""Instructions to numbers: words that the network learns, or embeddings of Wan's frozen UMT5 encoder."""
+"""Encoding of instructions: a learned table of words, or embeddings of Wan's frozen UMT5 encoder."""
 
 __all__ = ["instructions", "umt5"]

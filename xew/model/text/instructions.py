@@ -1,10 +1,10 @@
-"""The instruction as the network gets it: ids of words, or embeddings of a frozen text encoder.
+"""Encoding of instructions for the network: ids of words, or embeddings of a frozen text encoder.
 
 Reads  instructions; for UMT5 the encoder's weights and tokenizer.json
 Writes int32 [tokens] for the network's own table of words, or float32 [tokens width], zero past the end
 To add one: a `TextEncoder` and one line in TEXT_ENCODERS; from outside the repo, `module:NAME`.
 
-Embeddings of UMT5 are computed once an instruction and kept in <cache>/text, so that only the first run needs its 11 GB.
+Embeddings of UMT5 are cached in <cache>/text, so only the first run needs its 11 GB.
 """
 
 import hashlib
@@ -28,52 +28,49 @@ from xew.files import read_json, replacing
 from xew.model.text.umt5 import UMT5S, load_umt5
 
 VOCABULARY = 8192
-"""Number of rows of the learned table; row 0 is that of no word and stays zero."""
+"""Number of rows of the learned table; row 0 is padding and stays zero."""
 END, PAD = "</s>", "<pad>"
 ENCODE_BATCH = 16
 """Number of instructions that are embedded at once."""
 LENGTH_STEP = 32
-"""Number of tokens of which sequences are padded to a multiple, so that few shapes are compiled."""
+"""Number of tokens to a multiple of which sequences are padded, to compile few shapes."""
 
 
 @dataclass(frozen=True)
 class TextSource:
-    """What an experiment gives its encoder to work with."""
+    """Settings of an experiment for its text encoder."""
 
     tokens: int
-    """Largest number of tokens that the network takes."""
+    """Largest number of tokens of the network."""
     weights: Path | None
     tokenizer: Path | None
     cache: Path
-    """Folder for embeddings, made where one is written."""
+    """Folder for embeddings."""
 
 
 @dataclass(frozen=True)
 class TextEncoder:
-    """One way to turn instructions into what the network takes."""
+    """A text encoder."""
 
     encode: Callable[[TextSource, Sequence[str]], list[np.ndarray]]
-    """Function from instructions to int32 [n] (learned) or float32 [n width]; what is longer than the network takes is cut."""
+    """Function from instructions to int32 [n] (learned) or float32 [n width]; longer results than the network takes are cut."""
     width: int | None = None
-    """Width of the embeddings; None where the model's size says it."""
+    """Width of the embeddings; None takes the model size's."""
     learned: bool = False
-    """Whether the network itself has the table that the ids are rows of."""
+    """Whether ids index the network's learned table."""
 
 
 @dataclass(frozen=True)
 class Instructions:
-    """How an experiment's instructions become what its network takes."""
+    """The text encoder of an experiment with its settings."""
 
     encoder: TextEncoder
     source: TextSource
     prefix: str = ""
-    """Text put before every instruction."""
+    """Prefix of every instruction."""
 
     def encode(self, instructions: Iterable[str]) -> dict[str, np.ndarray]:
-        """Every distinct instruction as the network takes it.
-
-        Returns:
-            By instruction, int32 [l] where the table is learned, else float32 [l e]; zero past the end of the text.
+        """Distinct instructions -> int32 [l] of a learned table, or float32 [l e]; zero-padded.
 
         Raises:
             ConfigError: an encoder's files are missing or do not fit.
@@ -87,11 +84,8 @@ def _pad(array: np.ndarray, tokens: int) -> np.ndarray:
     return np.pad(array[:tokens], ((0, tokens - len(array[:tokens])), *((0, 0),) * (array.ndim - 1)))
 
 
-# A table that the network learns: needs no files.
-
-
 def encode_words(source: TextSource, instructions: Sequence[str]) -> list[np.ndarray]:
-    """Rows [n] int32 of the network's table by the hash of each word; an unknown word has one too, which means nothing yet."""
+    """Rows [n] int32 of the network's table, by the hash of each word."""
     return [np.array([_row(word) for word in _words(instruction)], np.int32) for instruction in instructions]
 
 
@@ -103,11 +97,8 @@ def _row(word: str) -> int:
     return 1 + int.from_bytes(hashlib.sha256(word.encode()).digest()[:8]) % (VOCABULARY - 1)
 
 
-# UMT5, as Wan uses it.
-
-
 def clean(text: str) -> str:
-    """Repaired characters, no HTML entities (also doubly escaped ones), single spaces: Wan's cleaning of prompts."""
+    """Clean a prompt as Wan does: repair characters, unescape HTML entities twice, collapse spaces."""
     return re.sub(r"\s+", " ", html.unescape(html.unescape(ftfy.fix_text(text)))).strip()
 
 
@@ -115,17 +106,17 @@ def load_tokenizer(path: Path) -> tokenizers.Tokenizer:
     """The tokenizer of a local copy of `google/umt5-xxl` (its folder, or its tokenizer.json).
 
     Raises:
-        ConfigError: there is none, or it is no tokenizer of T5's kind.
+        ConfigError: there is none, or it is not a T5 tokenizer.
     """
     file = path / "tokenizer.json" if path.is_dir() else path
     if not file.is_file():
         raise ConfigError(
-            f"there is no tokenizer at {file}; model.text_tokenizer is the folder google/umt5-xxl of Wan's files."
+            f"there is no tokenizer at {file}; set model.text_tokenizer to the folder google/umt5-xxl of Wan's files."
         )
     try:
         tokenizer = tokenizers.Tokenizer.from_file(str(file))
-    except Exception as error:  # the library raises no narrower kind
-        raise ConfigError(f"{file} is no tokenizer ({error}); expected the tokenizer.json of google/umt5-xxl.") from error
+    except Exception as error:  # the library raises no narrower type
+        raise ConfigError(f"{file} is not a tokenizer ({error}); expected the tokenizer.json of google/umt5-xxl.") from error
     lacking = [token for token in (END, PAD) if tokenizer.token_to_id(token) is None]
     if lacking:
         raise ConfigError(f"{file} has no token {' and no '.join(lacking)}; expected the tokenizer.json of google/umt5-xxl.")
@@ -135,13 +126,13 @@ def load_tokenizer(path: Path) -> tokenizers.Tokenizer:
 
 
 def token_ids(tokenizer: tokenizers.Tokenizer, text: str, tokens: int) -> Int[np.ndarray, " n"]:
-    """Ids int32 [n] of a cleaned text, cut so that with the end token they are at most `tokens`."""
+    """Ids int32 [n] of a cleaned text, cut to `tokens` with the end token."""
     ids = tokenizer.encode(clean(text), add_special_tokens=False).ids
     return np.array([*ids[: tokens - 1], tokenizer.token_to_id(END)], np.int32)
 
 
 def encode_with_umt5(name: str) -> Callable[[TextSource, Sequence[str]], list[np.ndarray]]:
-    """The `TextEncoder.encode` of an encoder in `UMT5S`: it reads what was embedded before, and computes and keeps the rest."""
+    """The `TextEncoder.encode` of an encoder in `UMT5S`; embeddings are cached."""
 
     def encode(source: TextSource, instructions: Sequence[str]) -> list[np.ndarray]:
         cache = _EmbeddingCache(source, name)
@@ -155,7 +146,7 @@ def encode_with_umt5(name: str) -> Callable[[TextSource, Sequence[str]], list[np
 
 
 def _embed(source: TextSource, name: str, instructions: Sequence[str]) -> Iterator[np.ndarray]:
-    """UMT5's embeddings [n width] float32 of instructions, in batches, in bfloat16 as Wan computes them."""
+    """UMT5's embeddings [n width] float32 of instructions, computed in batches in bfloat16 as in Wan."""
     weights, folder = _files(source)
     tokenizer = load_tokenizer(folder)
     ids = [token_ids(tokenizer, instruction, source.tokens) for instruction in instructions]
@@ -174,21 +165,21 @@ def _embed(source: TextSource, name: str, instructions: Sequence[str]) -> Iterat
 
 
 def _files(source: TextSource) -> tuple[Path, Path]:
-    """Weights and tokenizer that the config names."""
-    named = {"text_weights": source.weights, "text_tokenizer": source.tokenizer}
-    lacking = [f"model.{field}" for field, path in named.items() if path is None]
+    """Weights and tokenizer of the config."""
+    paths = {"text_weights": source.weights, "text_tokenizer": source.tokenizer}
+    missing = [f"model.{field}" for field, path in paths.items() if path is None]
     if source.weights is None or source.tokenizer is None:
         raise ConfigError(
-            f"the text encoder needs its files, and {' and '.join(lacking)} not set; give the paths of "
+            f"the text encoder needs {' and '.join(missing)}; set the paths of "
             "models_t5_umt5-xxl-enc-bf16.pth (or its safetensors) and of google/umt5-xxl, or choose model.text: learned."
         )
     return source.weights, source.tokenizer
 
 
 class _EmbeddingCache:
-    """Embeddings on disk, each named by its instruction and by what the encoder's files hold.
+    """Embeddings on disk, named by a hash of the instruction and of the encoder's files.
 
-    What the files held is noted too, so that where they are not at hand the embeddings still are.
+    The files' hashes are stored too, so embeddings can be read without the files.
     """
 
     def __init__(self, source: TextSource, name: str) -> None:
@@ -205,12 +196,12 @@ class _EmbeddingCache:
             np.save(file, embedding)
 
     def _fingerprint(self, path: Path) -> str:
-        """Sizes, beginnings and ends of a file or of a folder's files."""
+        """SHA-256 of sizes, beginnings and ends of a file or of a folder's files."""
         noted = read_json(self.notes) if self.notes.exists() else {}
         if not path.exists():
             if str(path) not in noted:
                 raise ConfigError(
-                    f"there is no {path}, which config and encoder need; get Wan2.2's text encoder, or fix the path."
+                    f"there is no {path}, which the text encoder needs; get Wan2.2's text encoder, or fix the path."
                 )
             return noted[str(path)]
         files = sorted(file for file in path.iterdir() if file.is_file()) if path.is_dir() else [path]

@@ -1,12 +1,11 @@
-"""UMT5's encoder, whose embeddings of the instruction Wan2.2 reads (Flax NNX).
+"""UMT5's encoder (Flax NNX), the text encoder of Wan2.2.
 
 Reads  token ids [b l], lengths [b]
 Writes embeddings [b l d] float32, zero past each length, as the network takes them
 To add a size: one line in UMT5S.
 
-It is T5's encoder with a table of relative positions in every layer (Chung et al., arXiv 2304.09151): no biases, norms
-without a mean, products of queries and keys that are not divided by the root of their width. Parity with transformers'
-UMT5EncoderModel is tested; `official_layout` and `hf_layout` are the names in Wan's .pth and in Hugging Face's files.
+T5's encoder with a table of relative positions in every layer (Chung et al., arXiv 2304.09151), without biases, means in norms
+and scaling of attention. Parity with transformers' UMT5EncoderModel is tested.
 """
 
 from dataclasses import dataclass
@@ -20,6 +19,7 @@ from jax import Array
 from jax.typing import DTypeLike
 from jaxtyping import Bool, Float, Int
 
+from xew.model.network.blocks import stack_layers
 from xew.model.weights.filling import fill
 from xew.model.weights.layout import Layout, Source
 from xew.model.weights.reading import read_tensors
@@ -29,7 +29,7 @@ EPSILON = 1e-6
 
 @dataclass(frozen=True)
 class Umt5Size:
-    """Everything that distinguishes one size of the encoder from another."""
+    """Hyperparameters of the encoder."""
 
     vocabulary: int
     dim: int
@@ -40,7 +40,7 @@ class Umt5Size:
     buckets: int = 32
     """Number of rows of a table of relative positions."""
     max_distance: int = 128
-    """Distance in tokens from which on all share a row."""
+    """Distance [tokens] from which on all share a row."""
 
 
 UMT5S = {
@@ -54,8 +54,8 @@ class Umt5Encoder(nnx.Module):
 
     Args:
         size: one of `UMT5S`.
-        dtype: of the matrix products; norms, softmax and the residual stream stay float32.
-        param_dtype: of the parameters; 5.7 billion of them are 11.4 GB in bfloat16, in which they are published.
+        dtype: of the matrix products; norms, softmax and the residual stream are float32.
+        param_dtype: of the parameters, published in bfloat16 (11.4 GB).
     """
 
     def __init__(
@@ -63,11 +63,11 @@ class Umt5Encoder(nnx.Module):
     ) -> None:
         self.size = size
         self.token_embedding = nnx.Embed(size.vocabulary, size.dim, dtype=dtype, param_dtype=param_dtype, rngs=rngs)
-        self.blocks = _stacked_blocks(size, dtype, param_dtype, rngs)
+        self.blocks = stack_layers(lambda layer: EncoderBlock(size, dtype, param_dtype, layer), size.depth, rngs)
         self.norm = _norm(size.dim, param_dtype, rngs)
 
     def __call__(self, ids: Int[Array, "b l"], lengths: Int[Array, " b"]) -> Float[Array, "b l d"]:
-        """Embeddings of ids [b l] int32 of which the first `lengths` [b] count: [b l d] float32, zero from there on."""
+        """Embeddings [b l d] float32 of ids [b l] int32 with valid lengths [b], zero past each length."""
         graph, layers = nnx.split(self.blocks)
         valid = jnp.arange(ids.shape[1])[None] < lengths[:, None]
         buckets = relative_buckets(ids.shape[1], self.size.buckets, self.size.max_distance)
@@ -80,7 +80,7 @@ class Umt5Encoder(nnx.Module):
 
 
 class EncoderBlock(nnx.Module):
-    """Self-attention, then a gated feed-forward, each on the norm of what it is added to."""
+    """Residual self-attention and gated feed-forward, each after a norm."""
 
     def __init__(self, size: Umt5Size, dtype: DTypeLike, param_dtype: DTypeLike, rngs: nnx.Rngs) -> None:
         self.norm1, self.norm2 = (_norm(size.dim, param_dtype, rngs) for _ in range(2))
@@ -90,22 +90,13 @@ class EncoderBlock(nnx.Module):
     def __call__(
         self, tokens: Float[Array, "b l d"], valid: Bool[Array, "b l"], buckets: Int[np.ndarray, "l l"]
     ) -> Float[Array, "b l d"]:
-        """One block's change of the tokens.
-
-        Args:
-            tokens: [b l d] float32.
-            valid: [b l] bool, tokens of the text.
-            buckets: [l l], row of the table of positions for each pair.
-
-        Returns:
-            Tokens [b l d] float32.
-        """
+        """Tokens [b l d], their valid mask [b l] and `relative_buckets` [l l] -> tokens [b l d], float32."""
         tokens = tokens + self.attn(self.norm1(tokens), valid, buckets).astype(jnp.float32)
         return tokens + self.ffn(self.norm2(tokens)).astype(jnp.float32)
 
 
 class Attention(nnx.Module):
-    """Multi-head self-attention to the valid tokens, biased by the layer's own table of relative positions."""
+    """Multi-head self-attention to the valid tokens, with a bias by relative position."""
 
     def __init__(self, size: Umt5Size, dtype: DTypeLike, param_dtype: DTypeLike, rngs: nnx.Rngs) -> None:
         inner = size.heads * size.head_dim
@@ -117,7 +108,7 @@ class Attention(nnx.Module):
     def __call__(
         self, tokens: Float[Array, "b l d"], valid: Bool[Array, "b l"], buckets: Int[np.ndarray, "l l"]
     ) -> Float[Array, "b l d"]:
-        """Attention of tokens [b l d] to those that are `valid` [b l]; `buckets` [l l] as of `EncoderBlock`: [b l d]."""
+        """Tokens [b l d] -> [b l d]; arguments as of `EncoderBlock`."""
         q, k, v = (layer(tokens).reshape(*tokens.shape[:2], self.heads, -1) for layer in (self.q, self.k, self.v))
         bias = self.position(jnp.asarray(buckets)).transpose(2, 0, 1)[None]
         mask = valid[:, None, None, :]
@@ -140,8 +131,8 @@ class GatedFeedForward(nnx.Module):
 def relative_buckets(length: int, buckets: int, max_distance: int) -> Int[np.ndarray, "l l"]:
     """Row of the table of positions for each pair of a query and a key: [l l] int.
 
-    Half of the rows are for keys after the query. Of each half, half are for one distance each and the others widen with the
-    logarithm of the distance up to `max_distance`.
+    Half of the rows are for keys after the query. Half of each half are for single distances, the others are logarithmic up to
+    `max_distance`.
     """
     relative = np.arange(length)[None] - np.arange(length)[:, None]
     distance, half = np.abs(relative), buckets // 2
@@ -151,43 +142,46 @@ def relative_buckets(length: int, buckets: int, max_distance: int) -> Int[np.nda
     return np.where(distance < exact, distance, np.minimum(widening, half - 1)) + half * (relative > 0)
 
 
+HF = "encoder.block.{}.layer."
+NAMES = {
+    "token_embedding.embedding": ("token_embedding.weight", "shared.weight"),
+    "norm.scale": ("norm.weight", "encoder.final_layer_norm.weight"),
+    "blocks.norm1.scale": ("blocks.{}.norm1.weight", f"{HF}0.layer_norm.weight"),
+    "blocks.attn.position.embedding": (
+        "blocks.{}.pos_embedding.embedding.weight",
+        f"{HF}0.SelfAttention.relative_attention_bias.weight",
+    ),
+    "blocks.norm2.scale": ("blocks.{}.norm2.weight", f"{HF}1.layer_norm.weight"),
+    "blocks.ffn.gate.kernel": ("blocks.{}.ffn.gate.0.weight", f"{HF}1.DenseReluDense.wi_0.weight"),
+    "blocks.ffn.first.kernel": ("blocks.{}.ffn.fc1.weight", f"{HF}1.DenseReluDense.wi_1.weight"),
+    "blocks.ffn.second.kernel": ("blocks.{}.ffn.fc2.weight", f"{HF}1.DenseReluDense.wo.weight"),
+    **{
+        f"blocks.attn.{part}.kernel": (f"blocks.{{}}.attn.{part}.weight", f"{HF}0.SelfAttention.{part}.weight")
+        for part in "qkvo"
+    },
+}
+"""Names of each leaf in Wan's .pth and in Hugging Face's files."""
+
+
 def official_layout(size: Umt5Size) -> Layout:
     """Names in Wan's `models_t5_umt5-xxl-enc-bf16.pth` (242 tensors at full size)."""
-    names = {
-        "norm1.scale": "blocks.{}.norm1.weight",
-        "attn.position.embedding": "blocks.{}.pos_embedding.embedding.weight",
-        "norm2.scale": "blocks.{}.norm2.weight",
-        "ffn.gate.kernel": "blocks.{}.ffn.gate.0.weight",
-        "ffn.first.kernel": "blocks.{}.ffn.fc1.weight",
-        "ffn.second.kernel": "blocks.{}.ffn.fc2.weight",
-    }
-    names |= {f"attn.{name}.kernel": f"blocks.{{}}.attn.{name}.weight" for name in "qkvo"}
-    return _layout(size, "token_embedding.weight", names, "norm.weight")
+    return _layout(size, 0)
 
 
 def hf_layout(size: Umt5Size) -> Layout:
-    """Names in Hugging Face's UMT5EncoderModel; `HF_DUPLICATE` may be there besides."""
-    names = {
-        "norm1.scale": "encoder.block.{}.layer.0.layer_norm.weight",
-        "attn.position.embedding": "encoder.block.{}.layer.0.SelfAttention.relative_attention_bias.weight",
-        "norm2.scale": "encoder.block.{}.layer.1.layer_norm.weight",
-        "ffn.gate.kernel": "encoder.block.{}.layer.1.DenseReluDense.wi_0.weight",
-        "ffn.first.kernel": "encoder.block.{}.layer.1.DenseReluDense.wi_1.weight",
-        "ffn.second.kernel": "encoder.block.{}.layer.1.DenseReluDense.wo.weight",
-    }
-    names |= {f"attn.{part}.kernel": f"encoder.block.{{}}.layer.0.SelfAttention.{part}.weight" for part in "qkvo"}
-    return _layout(size, "shared.weight", names, "encoder.final_layer_norm.weight")
+    """Names in Hugging Face's UMT5EncoderModel, besides an optional `HF_DUPLICATE`."""
+    return _layout(size, 1)
 
 
 HF_DUPLICATE = "encoder.embed_tokens.weight"
-"""The token embedding a second time, or the only one where `shared.weight` is left out."""
+"""Duplicate of the token embedding, or its only name if `shared.weight` is missing."""
 
 
 def load_umt5(path: Path, size: Umt5Size, dtype: DTypeLike = jnp.bfloat16) -> Umt5Encoder:
-    """The encoder with a checkpoint's weights, kept and multiplied in `dtype`; the names say which layout it is in.
+    """The encoder with a checkpoint's weights in `dtype`, in either layout.
 
     Raises:
-        ConfigError: there is no such file, or it does not fit; what differs is named.
+        ConfigError: there is no such file, or it does not fit.
     """
     tensors = read_tensors(path)
     if "token_embedding.weight" in tensors:
@@ -201,11 +195,12 @@ def load_umt5(path: Path, size: Umt5Size, dtype: DTypeLike = jnp.bfloat16) -> Um
     return encoder
 
 
-def _layout(size: Umt5Size, embedding: str, blocks: dict[str, str], norm: str) -> Layout:
-    layout = {"token_embedding.embedding": Source((embedding,)), "norm.scale": Source((norm,))}
-    for leaf, name in blocks.items():
-        keys = tuple(name.format(layer) for layer in range(size.depth))
-        layout[f"blocks.{leaf}"] = Source(keys, "linear" if leaf.endswith("kernel") else "as_is", stacked=True)
+def _layout(size: Umt5Size, column: int) -> Layout:
+    layout = {}
+    for leaf, names in NAMES.items():
+        stacked = leaf.startswith("blocks.")
+        keys = tuple(names[column].format(layer) for layer in range(size.depth if stacked else 1))
+        layout[leaf] = Source(keys, "linear" if leaf.endswith("kernel") else "as_is", stacked=stacked)
     return layout
 
 
@@ -215,14 +210,3 @@ def _norm(features: int, param_dtype: DTypeLike, rngs: nnx.Rngs) -> nnx.RMSNorm:
 
 def _linear(features: int, out: int, dtype: DTypeLike, param_dtype: DTypeLike, rngs: nnx.Rngs) -> nnx.Linear:
     return nnx.Linear(features, out, use_bias=False, dtype=dtype, param_dtype=param_dtype, rngs=rngs)
-
-
-def _stacked_blocks(size: Umt5Size, dtype: DTypeLike, param_dtype: DTypeLike, rngs: nnx.Rngs) -> EncoderBlock:
-    """`depth` blocks as one whose parameters have a leading layer axis."""
-
-    @nnx.split_rngs(splits=size.depth)
-    @nnx.vmap(in_axes=0, out_axes=0)
-    def create(layer_rngs: nnx.Rngs) -> EncoderBlock:
-        return EncoderBlock(size, dtype, param_dtype, layer_rngs)
-
-    return create(rngs)

@@ -1,6 +1,6 @@
-"""Training: batches in an exact order, one compiled step, memory estimated beforehand, curves and samples.
+"""Training: batches in a reproducible order, one compiled step, a memory estimate, curves and samples.
 
-The same numbers on one device and on many, interrupted or not.
+Results are the same on one device and on many, interrupted or not.
 """
 
 __all__ = ["data", "flops", "loop", "memory", "order", "samples", "start", "step"]

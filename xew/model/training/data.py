@@ -1,8 +1,4 @@
-"""Samples for training: clips of the latent cache with what goes with them; order.py makes batches of them.
-
-Reads  the latent cache
-Writes `Batch`
-"""
+"""Training samples: clips of the latent cache with conditions and text; order.py makes batches of them."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -25,7 +21,7 @@ from xew.model.video.frames import TEMPORAL_FACTOR
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Batch:
-    """The arrays that the network trains on."""
+    """Arrays of a training batch."""
 
     latents: Any
     """[b t h w c] float32, the RGB stream."""
@@ -34,17 +30,15 @@ class Batch:
     text: Any
     """[b l e] float32, or [b l] int32 rows of the network's table of words; zero-padded."""
     valid: Any = None
-    """[b t] float32 valid mask, 1 where a latent frame shows the episode and 0 past its end; None where all do."""
+    """[b t] float32 mask, 1 for latent frames of the episode and 0 past its end; None if all are valid."""
     following: "Batch | None" = None
-    """Next chunk, whose first frame is the last of this one; None where one chunk is trained. A sample whose episode ends
-    before it has a following chunk of which no frame is valid."""
+    """Next chunk, whose first frame is the last of this one, or None; no frame is valid if the episode ends before it."""
 
 
 class ClipSource:
     """Random access to the training samples of the cache, for Grain: index -> Batch without its leading axis.
 
-    Instructions are as the network takes them, [l e] float32 or [l] int32. Every batch has a part of `replay` besides the
-    episodes to learn from.
+    Samples of `episodes` come first, then those of `replay`. Text is [l e] float32 or [l] int32 by instruction.
     """
 
     def __init__(
@@ -101,18 +95,18 @@ class ClipSource:
 
 
 def valid_frames(left: int, frames: int) -> np.ndarray:
-    """Valid mask [t] float32 of a clip's latent frames that show any of the `left` frames of its episode from there on."""
+    """Mask [t] float32 of the latent frames of a clip that show any of the `left` remaining frames of its episode."""
     firsts = np.maximum(np.arange(latent_frames(frames)) * TEMPORAL_FACTOR - (TEMPORAL_FACTOR - 1), 0)
     return (firsts < left).astype(np.float32)
 
 
 def stack(examples: Sequence[Batch]) -> Batch:
-    """Join examples to a batch with a leading axis [b]."""
+    """Stack samples to a batch with a leading axis [b]."""
     return jax.tree.map(lambda *leaves: np.stack(leaves), *examples)
 
 
 def fake_batch(inputs: ClipInputs, batch: int, seed: int = 0) -> Batch:
-    """Make a batch [b ...] of noise in the shapes that the experiment's data would have, for tests and compile checks."""
+    """Make a batch [b ...] of noise in the shapes of an experiment's data, for tests and benchmarks."""
     rng = np.random.default_rng(seed)
     text_shape = inputs.shapes["text"]
 

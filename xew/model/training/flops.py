@@ -1,4 +1,4 @@
-"""How much arithmetic a forward pass and a training step do, counted on the model, and how much devices can do at most."""
+"""FLOPs of a forward pass and a training step, counted on the model, and peak FLOPs of devices."""
 
 from collections.abc import Sequence
 
@@ -10,11 +10,11 @@ from xew.model.network.tokens import TokenGrid
 from xew.model.settings.parts import TrainSpec
 
 PEAK_FLOPS = {"H100": 989e12, "H200": 989e12, "A100": 312e12}
-"""Dense bfloat16 FLOPs a second by the maker's data sheets, by part of the device's name."""
+"""Dense bfloat16 FLOPs per second from data sheets, by part of the device's name."""
 
 
 def flops_of_step(spec: TrainSpec) -> float:
-    """Model FLOPs of one training step over all devices: three times the forward pass, recomputation not counted."""
+    """Model FLOPs of one training step over all devices: three forward passes, without recomputation as usual for MFU."""
     network, batch = spec.network, spec.settings.batch
     forward = flops(
         network.size, spec.inputs.grids, batch=batch, channels=network.channels, visibility=network.settings.visibility
@@ -32,17 +32,15 @@ def flops(
     cached: bool = False,
     channels: int = 48,
 ) -> float:
-    """Number of floating-point operations of one forward pass: two for each multiply-add of the matrix products.
-
-    A training step is three times this (what remat computes again is not counted, as is usual for MFU).
+    """FLOPs of one forward pass: two for each multiply-add of the matrix products.
 
     Args:
         size: of the model.
         grids: tokens (t', h', w') of each stream, RGB first, as from `token_grid`.
-        text_tokens: the model's own number where left out.
-        batch: samples.
+        text_tokens: by default the model's number.
+        batch: number of samples.
         visibility: as of the model.
-        cached: a step of sampling in which the condition tokens are read from a cache.
+        cached: whether the condition tokens are read from a cache, as in sampling.
         channels: of the latents.
     """
     text = size.text_tokens if text_tokens is None else text_tokens
@@ -60,5 +58,5 @@ def flops(
 
 
 def peak_flops(device_kind: str) -> float | None:
-    """FLOPs a second of one device by its name; None where it is not known, and then no MFU is logged."""
+    """Peak FLOPs per second of a device by its name, or None if unknown."""
     return next((peak for name, peak in PEAK_FLOPS.items() if name in device_kind), None)

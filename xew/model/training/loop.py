@@ -1,4 +1,4 @@
-"""The loop of every training run: steps, log lines, checkpoints, samples, and an orderly end when a signal asks for it."""
+"""The training loop: steps, log lines, checkpoints, samples, and a clean stop on signals."""
 
 import contextlib
 import signal
@@ -18,22 +18,22 @@ from xew.model.runs.session import Session
 from xew.model.training.flops import peak_flops
 
 STOPPED = 128 + signal.SIGTERM
-"""Exit status of a run that was asked to stop before its last step: it is saved, but nobody may take it for done."""
+"""Exit status of a run that was stopped and saved before its last step."""
 
 
 @dataclass(frozen=True)
 class Timetable:
-    """When a run logs, saves and draws samples, all in steps."""
+    """Intervals of logging, saving and sampling, in steps."""
 
     steps: int
     log_every: int
     save_every: int
     sample_every: int
-    """0 draws no samples."""
+    """0 disables samples."""
     learning_rate: Callable[[int], Any]
-    """Function from the number of steps taken to the rate of the next."""
+    """Learning rate of the next step, by number of steps taken."""
     is_over: Callable[[int], bool] | None = None
-    """Function from the number of steps taken to whether the run ends before `steps`, as one with a budget of time."""
+    """Whether the run ends before `steps`, by number of steps taken, as with a time budget."""
 
 
 @dataclass
@@ -41,33 +41,33 @@ class Meter:
     """The results and times of the steps since the last log line."""
 
     summarize: Callable[[Sequence[Any]], dict[str, float]]
-    """Means of the results of some steps; each result has a field `finite`."""
+    """Function that averages the results of some steps; each result has a field `finite`."""
     samples: int
     """Number of samples of one step."""
     flops: float = 0.0
-    """FLOPs of one step, forward and backward, counted on the model; 0 where they are not known."""
+    """Model FLOPs of one step; 0 if unknown."""
     results: list[Any] = field(default_factory=list)
     wait_s: float = 0.0
-    """Time in which the devices had to wait for data."""
+    """Time spent waiting for data [s]."""
     since: float = field(default_factory=time.perf_counter)
 
     def add(self, result: Any, wait_s: float) -> None:
-        """Add the result of a step, and the time [s] that it waited for its batch."""
+        """Add the result of a step and its waiting time [s]."""
         self.results.append(result)
         self.wait_s += wait_s
 
     def check_finite(self) -> None:
-        """End the program if any step since the last log line was not finite: the state is spoilt and must not be saved."""
+        """End the program if any step since the last log line was not finite, before the state is saved."""
         steps = len(self.results)
         for number, result in enumerate(self.results):
             if not bool(result.finite):
                 sys.exit(
-                    f"error: loss, gradients or update are not finite {steps - number - 1} steps ago; nothing of it was saved. "
-                    "--resume returns to the last checkpoint, or lower the rate (train.learning_rate)."
+                    f"error: loss, gradients or update were not finite {steps - number - 1} steps ago and were not saved. "
+                    "Continue from the last checkpoint with --resume, or lower train.learning_rate."
                 )
 
     def take(self) -> dict[str, float]:
-        """Take the values of a log line, and start over."""
+        """Return the values of a log line, and reset the meter."""
         results, seconds = jax.device_get(self.results), time.perf_counter() - self.since
         values = self.summarize(results) | {
             "time/step_s": seconds / len(results),
@@ -84,14 +84,14 @@ class Meter:
 
     @contextlib.contextmanager
     def pause(self) -> Iterator[None]:
-        """Leave out the time of the block, which is not training."""
+        """Exclude the time of the block."""
         begin = time.perf_counter()
         yield
         self.since += time.perf_counter() - begin
 
 
 class StopSignal:
-    """Notes SIGTERM and SIGINT, so that the run saves before it ends."""
+    """Handler of SIGTERM and SIGINT, to save the run before it ends."""
 
     def __init__(self) -> None:
         self.received = False
@@ -101,13 +101,13 @@ class StopSignal:
         self.received = True
 
     def is_agreed(self) -> bool:
-        """Whether any process was asked to stop; all processes must ask at the same step."""
+        """Whether any process received a signal; all processes must call this at the same step."""
         if jax.process_count() == 1:
             return self.received
         return bool(np.any(multihost_utils.process_allgather(np.asarray(self.received))))
 
     def release(self) -> None:
-        """Give the signals back to who had them."""
+        """Restore the previous handlers."""
         for number, handler in self.before.items():
             signal.signal(number, handler)
 
@@ -122,23 +122,25 @@ def run_steps(
     draw_samples: Callable[[TrainState, int], None],
     place: Callable[[Any], Any] = lambda batch: batch,
 ) -> TrainState:
-    """Go from the given state to the last step; log, save and draw samples when the timetable says.
-
-    Where a signal asks to stop before, the state that was reached is saved and returned.
+    """Train from the given state to the last step; after a signal, the current state is saved and returned.
 
     Args:
+        timetable: intervals of logging, saving and sampling.
+        session: open files of the run.
+        meter: of results and times.
         take_step: (state, batch) -> (next state, result).
+        state: to start from.
         batches: an iterator of this process's batches, with its position (get_state).
         draw_samples: called with the state and its step.
-        place: brings a batch to the devices; its time counts as waiting for data.
+        place: function that moves a batch to the devices; its time counts as waiting for data.
     """
     begin, stop, log = int(state.step), StopSignal(), session.log
     total = timetable.steps if timetable.is_over is None else None
     progress = tqdm(iter(range(begin, timetable.steps)), desc="train", initial=begin, total=total, file=sys.stderr)
     for step in (number + 1 for number in progress):
-        asked = time.perf_counter()
+        requested = time.perf_counter()
         batch = place(next(batches))
-        wait_s = time.perf_counter() - asked
+        wait_s = time.perf_counter() - requested
         state, result = take_step(state, batch)
         meter.add(result, wait_s)
         last = step == timetable.steps or (timetable.is_over is not None and timetable.is_over(step))

@@ -1,8 +1,7 @@
-"""How much memory a training run needs, before anything is compiled.
+"""Estimate of a training run's memory on each device, from shapes alone.
 
-The numbers are of one device: parameters, optimizer, moving average and gradients are cut along `fsdp`; activations are
-those of the device's samples of one part of the batch. The estimate is made from shapes alone; what XLA adds (buffers that
-overlap, fragments) is covered by `MARGIN`.
+Parameters, optimizer, moving average and gradients are sharded along `fsdp`; activations cover the device's samples in
+one part of the batch. `MARGIN` covers XLA's additional buffers.
 """
 
 import math
@@ -25,35 +24,35 @@ from xew.model.training.step import Trainer
 from xew.model.video.frames import TEMPORAL_FACTOR
 
 MARGIN = 1.1
-"""Factor for what the estimate does not see."""
+"""Safety factor of the estimate."""
 
 
 @dataclass(frozen=True)
 class Memory:
-    """Bytes on each device, by what they are for."""
+    """Bytes on each device, by purpose."""
 
     parts: dict[str, float]
     layout: str
-    """Layout of the work, in words."""
+    """Description of the layout."""
 
     @property
     def total(self) -> float:
         return MARGIN * sum(self.parts.values())
 
     def line(self) -> str:
-        """All parts in one line of text."""
+        """All parts in one line."""
         shares = ", ".join(f"{name} {size / 1e9:.2f}" for name, size in self.parts.items() if size)
         return f"memory of each device [GB]: {shares}; with a margin of {MARGIN - 1:.0%} {self.total / 1e9:.2f} ({self.layout})"
 
     def table(self) -> str:
-        """Text with one part a line."""
+        """One part per line."""
         lines = [f"{name:<28}{size / 1e9:10.3f} GB" for name, size in self.parts.items()]
         total = f"{'total with a margin of ' + format(MARGIN - 1, '.0%'):<28}{self.total / 1e9:10.3f} GB"
         return "\n".join([f"each device, {self.layout}:", *lines, total])
 
 
 def estimate_memory(trainer: Trainer, encoding: Encoding) -> Memory:
-    """Estimate what each device of the trainer's mesh needs to train, and the codec between two chunks; none need be there."""
+    """Estimate the memory of each device of the trainer's mesh, which may be abstract, with the codec between two chunks."""
     spec, state, params = trainer.spec, trainer.shapes, trainer.network_shapes
     settings, network = spec.settings, spec.network
     devices, fsdp = trainer.mesh.size, trainer.mesh.shape["fsdp"]
@@ -64,7 +63,7 @@ def estimate_memory(trainer: Trainer, encoding: Encoding) -> Memory:
     samples = settings.batch / devices / settings.accumulate
     parts = {
         "parameters": shard_bytes(state.params),
-        "parameters kept as they are": shard_bytes(state.base),
+        "frozen parameters": shard_bytes(state.base),
         "optimizer": shard_bytes(state.optimizer),
         "moving average": shard_bytes(state.ema),
         f"rounded to {network.settings.dtype}": weights * compute if compute < 4 else 0.0,
@@ -78,23 +77,23 @@ def estimate_memory(trainer: Trainer, encoding: Encoding) -> Memory:
 
 
 def shard_bytes(tree: Any) -> float:
-    """Bytes that each device holds of a tree of shapes with their shardings."""
+    """Bytes on each device of a tree of shapes with shardings."""
     leaves = jax.tree.leaves(tree)
     return float(sum(math.prod(leaf.sharding.shard_shape(leaf.shape)) * leaf.dtype.itemsize for leaf in leaves))
 
 
 def activation_bytes(network: Network, inputs: ClipInputs) -> float:
-    """Bytes of activations of one sample: what is kept of every block, and the work of one block in the backward pass."""
+    """Bytes of activations of one sample: those saved by every block, and one block's work in the backward pass."""
     settings, size = network.settings, network.size
     tokens = sum(math.prod(grid) for grid in inputs.grids)
     compute, logits = jnp.dtype(settings.dtype).itemsize, logits_bytes(network, tokens)
-    kept = tokens * kept_bytes(size, settings.remat, compute) + (logits if settings.remat == "none" else 0.0)
+    saved = tokens * kept_bytes(size, settings.remat, compute) + (logits if settings.remat == "none" else 0.0)
     work = compute * (19 * size.dim + 2 * size.ffn_dim)  # of a token: 14 widths, two of the hidden width, and the norms
-    return size.depth * kept + 2 * (tokens * work + logits)
+    return size.depth * saved + 2 * (tokens * work + logits)
 
 
 def codec_bytes(encoding: Encoding, samples: float) -> float:
-    """Bytes of the codec that decodes and encodes between two chunks: weights, and four of its widest arrays a sample."""
+    """Bytes of wan_vae between two chunks: weights, and four of its widest arrays for each sample."""
     settings, clip, size = encoding.codec, encoding.inputs.clip, encoding.autoencoder
     if size is None:
         return 0.0
@@ -105,23 +104,23 @@ def codec_bytes(encoding: Encoding, samples: float) -> float:
 
 
 def kept_bytes(size: ModelSize, remat: RematName, compute: int) -> float:
-    """Bytes a token that each block leaves for the backward pass (a test counts them in the traced network)."""
+    """Bytes per token that each block saves for the backward pass."""
     return {
         "full": compute * size.dim,
         "attention": 3 * compute * size.dim,
         "dots": compute * (10 * size.dim + size.ffn_dim),
-        # Nothing is fused away: every step of the norms, modulations and rotations keeps its float32 result.
+        # Every step of the norms, modulations and rotations saves its float32 result.
         "none": (104 + 7 * compute) * size.dim + 6 * compute * size.ffn_dim,
     }[remat]
 
 
 def logits_bytes(network: Network, tokens: int) -> float:
-    """Bytes of XLA's attention, which forms every pair of tokens (float32, and rounded); cuDNN's forms none."""
+    """Bytes of the pairwise logits of XLA's attention (float32, and rounded); cuDNN's forms none."""
     return 0.0 if network.settings.dtype == "bfloat16" else 8.0 * network.size.heads * tokens**2
 
 
 def device_memory() -> float:
-    """Bytes of each device that a program may use; of the machine, shared by its devices, on a CPU."""
+    """Available bytes of each device; on a CPU, the machine's memory divided by its devices."""
     stats = jax.local_devices()[0].memory_stats()
     if stats and "bytes_limit" in stats:
         return float(stats["bytes_limit"])
@@ -129,7 +128,7 @@ def device_memory() -> float:
 
 
 def check_memory(memory: Memory, ignore: bool = False) -> None:
-    """Print the estimate and the memory that is available. Raises ConfigError if it is too much, unless that is ignored."""
+    """Print the estimated and the available memory. Raises ConfigError if it is insufficient, unless `ignore` is set."""
     available = device_memory()
     if jax.process_index() == 0:
         print(f"{memory.line()}; there is {available / 1e9:.2f}", file=sys.stderr)
@@ -137,6 +136,6 @@ def check_memory(memory: Memory, ignore: bool = False) -> None:
         raise ConfigError(
             f"training needs about {memory.total / 1e9:.1f} GB a device, there is {available / 1e9:.1f} GB ({memory.layout}). "
             "Use more devices with a larger mesh.fsdp, --model.remat full, a smaller --train.batch, a larger "
-            "--train.accumulate or --train.mu-dtype bfloat16; on a GPU the variable XLA_PYTHON_CLIENT_MEM_FRACTION=0.95 lets "
-            "JAX have more than its usual three quarters; --ignore-memory starts all the same."
+            "--train.accumulate or --train.mu-dtype bfloat16; on a GPU XLA_PYTHON_CLIENT_MEM_FRACTION=0.95 lets JAX use more "
+            "than three quarters; --ignore-memory starts anyway."
         )

@@ -1,8 +1,4 @@
-"""The order of training samples: shuffled batches without end, read ahead in threads, which a resumed run continues.
-
-Reads  `ClipSource`
-Writes `Batch`
-"""
+"""The order of training samples: endless shuffled batches, read ahead in threads, with a position that can be restored."""
 
 import grain
 import numpy as np
@@ -11,31 +7,29 @@ from xew.model.settings.settings import count_replayed
 from xew.model.training.data import Batch, ClipSource, stack
 
 PASSES = 2**40
-"""Passes over the samples. Training ends before, and Grain, which rounds the length of an endless data set up to one more
-than Python can index, can count them."""
+"""Number of passes over the samples, never reached; Python cannot index Grain's endless data sets."""
 
 
 def make_dataset(
     source: ClipSource, batch: int, seed: int, replay: float = 0.0, own: np.ndarray | None = None
 ) -> grain.IterDataset:
-    """Make endless shuffled batches; the iterator's get_state and set_state carry its position.
-
-    The order is that of whole batches, of which each process loads its own samples, so that neither the numbers nor the
-    position depend on how many processes there are.
+    """Make endless shuffled batches, whose iterator has get_state and set_state; independent of the number of processes.
 
     Args:
-        batch: samples over all processes.
-        replay: part of each batch that comes from the source's replayed episodes.
-        own: [b] numbers of the samples of each batch that this process loads; all where left out.
+        source: of the samples.
+        batch: number of samples over all processes.
+        seed: of the order.
+        replay: part of each batch from the source's replayed episodes.
+        own: [b] indices of the samples of each batch that this process loads, by default all.
     """
-    old = count_replayed(batch, replay)
-    fresh = _shuffle(range(source.fresh), seed, batch - old)
-    again = _shuffle(range(source.fresh, len(source)), seed + 1, old) if old else None
+    count = count_replayed(batch, replay)
+    fresh = _shuffle(range(source.fresh), seed, batch - count)
+    replayed = _shuffle(range(source.fresh, len(source)), seed + 1, count) if count else None
     own = np.arange(batch) if own is None else own
 
     def load(number: int, indices: np.ndarray) -> Batch:
-        if again is not None:
-            indices = np.concatenate([indices, again[number]])
+        if replayed is not None:
+            indices = np.concatenate([indices, replayed[number]])
         return stack([source[int(index)] for index in indices[own]])
 
     dataset = fresh.map_with_index(load)
@@ -43,5 +37,5 @@ def make_dataset(
 
 
 def _shuffle(samples: range, seed: int, count: int) -> grain.MapDataset:
-    """Make batches [count] of sample numbers without end; each pass over the samples has its own order."""
+    """Make endless batches [count] of sample indices; each pass over the samples has its own order."""
     return grain.MapDataset.source(samples).seed(seed).shuffle().repeat(PASSES).batch(count)

@@ -1,4 +1,4 @@
-"""Sample videos in training: one clip of each sample episode, predicted and compared with the ground truth."""
+"""Sample videos in training: one predicted clip of each sample episode, compared with the ground truth."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -27,22 +27,18 @@ def log_samples(
 ) -> None:
     """Predict one clip of each sample episode, by name; log PSNR, a strip (ground truth above prediction) and a video.
 
-    Every process predicts, because each has a part of the parameters; the one with a log writes.
+    Every process predicts, because parameters are sharded; the one with a log writes.
     """
     clip = experiment.clip
     predicted = make_predictor(experiment, codec, params, scales).predict(list(episodes.values()), clip.frames)
     if log is None:
         return
-    pairs = {}
+    scores = {}
     for (name, (folder, _)), video in zip(episodes.items(), predicted, strict=True):
         truth = to_model_size(read_video(folder / "rgb.mkv")[: clip.frames], clip.height, clip.width)
-        pairs[name] = truth, video[: len(truth)]
-    scores = {}
-    for name, (truth, video) in pairs.items():
+        video = video[: len(truth)]
         scores[f"sample/psnr/{name}"] = psnr(video[1:], truth[1:])
         scores[f"sample/psnr_of_first_frame/{name}"] = psnr(np.broadcast_to(truth[:1], truth[1:].shape), truth[1:])
-    strips = {name: strip(*pair) for name, pair in pairs.items()}
-    for name, pair in pairs.items():
-        log.image(step, f"sample/{name}", strips[name])
-        log.video(step, f"sample_video/{name}", np.concatenate(pair, axis=2))
+        log.image(step, f"sample/{name}", strip(truth, video))
+        log.video(step, f"sample_video/{name}", np.concatenate([truth, video], axis=2))
     log.scalars(step, scores)

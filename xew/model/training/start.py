@@ -1,4 +1,4 @@
-"""What a run starts from: random parameters, published weights, another run's, or its own latest checkpoint."""
+"""The initial state of a run: random parameters, published weights, another run's, or its own latest checkpoint."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -12,9 +12,9 @@ from xew.model.training.step import Trainer
 
 
 def begin_state(trainer: Trainer, start_from: Path | None, weights: Path | None, session: Session, batches: Any) -> TrainState:
-    """Make the state of step 0, or restore that of the latest checkpoint with the position of the data.
+    """Make the state of step 0 or restore the latest checkpoint with the position of the data.
 
-    The network starts from the run to adapt, published weights or random numbers; with LoRA it is needed in a resumed run too.
+    The network starts from the run to adapt, published weights or random parameters.
     """
     resumed = _resume(session, trainer.shapes, batches) if session.step > 0 else None
     if resumed is not None and not trainer.spec.lora_rank:
@@ -28,10 +28,10 @@ def begin_state(trainer: Trainer, start_from: Path | None, weights: Path | None,
 
 
 def _resume(session: Session, shapes: TrainState, batches: Any) -> TrainState:
-    """Restore the state of the latest checkpoint, and put the batches where they were left."""
+    """Restore the latest checkpoint and the position of the batches."""
     state, position = restore_state(session.checkpoints, shapes)
     try:
         batches.set_state(position)
-    except Exception as error:  # of whatever library the position comes from
-        raise damaged(session.out, session.step, ("data",), f"the position of the data is none: {error}") from error
+    except Exception as error:  # Grain raises many types
+        raise damaged(session.out, session.step, ("data",), f"the position of the data is invalid: {error}") from error
     return state

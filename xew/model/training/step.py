@@ -1,12 +1,7 @@
-"""One step of training, compiled for the mesh: noise, prediction, the loss (of flow_matching.py), gradients, update.
+"""One training step, compiled for the mesh: noise, prediction, loss, gradients, update.
 
-Reads  `TrainState`, `Batch`
-Writes the next `TrainState`, `StepResult`
-The optimizer is made in settings/optimizer.py, the noise in diffusion/flow_matching.py.
-
-The parameters are float32. The linear layers' are rounded to the network's dtype once a step, before they are gathered
-along `fsdp`, so that the traffic and the gradients have that dtype too; the numbers are the same as if every layer
-rounded its own.
+Parameters are float32. Those of linear layers are rounded to the network's dtype (mixed precision) once a step, before they are
+gathered along `fsdp`, so traffic and gradients have that dtype too.
 """
 
 import functools
@@ -39,18 +34,18 @@ from xew.model.settings.parts import TrainSpec
 from xew.model.training.data import Batch
 
 HISTORY_KEY = 7
-"""Folded into a sample's key for the noise of its earlier frames, which `training_pair` does not know of."""
+"""Constant folded into a sample's key for the noise of its earlier frames."""
 
 
 class StepResult(NamedTuple):
-    """What one training step reports; small, and the same on every process."""
+    """Results of one training step, the same on every process."""
 
     losses: Array
-    """[b k], one for each chunk of each sample."""
+    """[b k], for each chunk of each sample."""
     sigma: Array
-    """[b k], their noise levels."""
+    """[b k], noise levels."""
     weights: Array
-    """[b k], each chunk's share in its sample's loss: 1, a half, or 0 where the episode has ended before."""
+    """[b k], each chunk's weight in its sample's loss: 1, a half, or 0 past the episode's end."""
     gradient_norm: Array
     """Global norm before clipping."""
     finite: Array
@@ -58,69 +53,60 @@ class StepResult(NamedTuple):
 
 
 class Samples(NamedTuple):
-    """Some samples of a batch: every leaf has them as its leading axis."""
+    """Samples of a batch, on the leading axis of every leaf."""
 
     batch: Batch
     weights: Array
     """[b k], see `StepResult.weights`."""
     keys: Array
-    """[b] random keys, so that a sample's noise does not depend on how the batch is cut."""
+    """[b] random keys, one for each sample."""
 
 
 @dataclass(frozen=True)
 class Trainer:
-    """Trains a network on a mesh: the random start, the compiled step, and the parameters for inference.
+    """Trains a network on a mesh.
 
-    The step's noise depends on the seed, the step and the place in the batch only, so that a resumed run repeats it.
+    The noise depends only on the seed, the step and the position in the batch, so a resumed run repeats it.
     """
 
     spec: TrainSpec
     mesh: Any
-    """Mesh of the devices; an abstract one serves to ask for shapes alone."""
+    """Mesh of the devices; abstract if only shapes are needed."""
     graph: nnx.GraphDef
     shapes: TrainState
-    """Shapes, types and shardings of the state; its step has a copy on every device."""
+    """Shapes, types and shardings of the state."""
     codec: Codec | None = None
-    """Needed where `train.chunks` is 2, to decode and encode the first chunk's prediction."""
+    """Codec of the first chunk's prediction if `train.chunks` is 2."""
 
     @property
     def network_shapes(self) -> Any:
-        """Shapes, types and shardings of the network's parameters, which with LoRA are not those that are learned."""
+        """Shapes, types and shardings of the network's parameters, with LoRA the frozen ones."""
         return self.shapes.params if self.shapes.base is None else self.shapes.base
 
     def init_state(self, start: Any = None) -> TrainState:
-        """Make the state of step 0, on the devices where each part of it lies.
-
-        Args:
-            start: parameters to begin with, placed on the mesh; random where left out. They are given up to the state.
-        """
+        """Make the state of step 0 from parameters on the mesh, which are donated, or from random ones."""
         with jax.set_mesh(self.mesh):
             return self._compiled_init(start)
 
     def random_network(self) -> tuple[nnx.GraphDef, Any]:
-        """The network's structure and its parameters at their random start, made where they lie on the mesh."""
+        """The network's structure and its initial random parameters on the mesh."""
         network = self.spec.network
         init = jax.jit(lambda: nnx.state(WorldModel(network), nnx.Param), out_shardings=list_shardings(self.network_shapes))
         return self.graph, init()
 
     def average_params(self, state: TrainState) -> Any:
-        """The network's parameters for inference: the moving average where one is kept."""
+        """The network's parameters for inference: the moving average if there is one."""
         with jax.set_mesh(self.mesh):
             return jax.jit(apply_lora)(state.base, state.params if state.ema is None else state.ema)
 
     def place(self, batch: Batch) -> Batch:
-        """Put this process's samples on the mesh as its shard of the whole batch."""
+        """Place this process's samples on the mesh as its part of the batch."""
         return place_batch(batch, self.mesh)
 
     def step(self, state: TrainState, batch: Batch) -> tuple[TrainState, StepResult]:
-        """Take a step with a batch on the mesh. The given state is used up."""
+        """Take a step with a batch on the mesh. The given state is donated."""
         with jax.set_mesh(self.mesh):
             return self._compiled_step(state, batch, self._codec_copies)
-
-    def lower_step(self, state: TrainState, batch: Batch) -> jax.stages.Lowered:
-        """The step's program for arrays or for their shapes and shardings, to compile without running and see its memory."""
-        with jax.set_mesh(self.mesh):
-            return self._compiled_step.lower(state, batch, self._codec_copies)
 
     @functools.cached_property
     def _compiled_init(self) -> Callable[[Any], TrainState]:
@@ -133,7 +119,7 @@ class Trainer:
 
     @functools.cached_property
     def _codec_copies(self) -> Codec | None:
-        """The codec on every device, if the step needs it."""
+        """The codec on every device if the step needs it."""
         if self.codec is None or self.spec.settings.chunks == 1:
             return None
         return jax.device_put(jax.tree.map(np.asarray, self.codec), self.shapes.step.sharding)
@@ -156,7 +142,7 @@ class Trainer:
         return TrainState(state.step + 1, learned, moments, ema, state.base), result
 
     def _keep_sharded(self, tree: Any) -> Any:
-        """Keep a tree like that of the parameters cut along fsdp as they are: the compiler might gather it too soon."""
+        """Constrain a tree of parameters or gradients to its sharding along fsdp, or the compiler may gather it too soon."""
         leaves, structure = jax.tree.flatten(tree)
         shardings = jax.tree.leaves(list_shardings(self.network_shapes))
         constrained = [jax.lax.with_sharding_constraint(*pair) for pair in zip(leaves, shardings, strict=True)]
@@ -165,8 +151,7 @@ class Trainer:
     def gradients(self, params: Any, samples: Samples, codec: Codec | None) -> tuple[Any, Array, Array]:
         """Gradients of the mean loss over samples, and the chunks' losses and noise levels [b k].
 
-        A sample's loss is the mean over its chunks. Sums over parts of the batch (`train.accumulate`) and over chunks are in
-        float32.
+        Sums over parts of the batch (`train.accumulate`) and over chunks are in float32.
         """
         size, parts = len(samples.keys), self.spec.settings.accumulate
         if parts == 1:
@@ -182,7 +167,7 @@ class Trainer:
         return gradients, join_samples(losses), join_samples(sigma)
 
     def _part_gradients(self, params: Any, samples: Samples, codec: Codec | None, size: int) -> tuple[Any, Array, Array]:
-        """Gradients, losses and noise levels of one part; `size` is the number of samples of the whole batch."""
+        """Gradients, losses and noise levels of one part of a batch of `size` samples."""
         settings = self.spec.settings
         gradients, losses, sigmas, chunk = None, [], [], samples.batch
         for number in range(samples.weights.shape[1]):
@@ -201,7 +186,7 @@ class Trainer:
         return gradients, jnp.stack(losses, axis=1), jnp.stack(sigmas, axis=1)
 
     def _chunk_gradients(self, params: Any, chunk: Batch, pair: TrainingPair, shares: Array) -> tuple[Any, Array, Array]:
-        """Gradients, losses [b] and prediction of one chunk, whose samples have these shares in the loss [b]."""
+        """Gradients, losses [b] and prediction of one chunk; `shares` [b] are the samples' weights in the loss."""
         strength = self.spec.settings.motion_loss_weight
         weights = motion_weights(chunk.latents, strength) if strength else None
 
@@ -215,13 +200,13 @@ class Trainer:
 
 
 def make_trainer(spec: TrainSpec, mesh: Mesh | AbstractMesh, codec: Codec | None = None) -> Trainer:
-    """Lay a network and its optimizer out on a mesh, without computing anything."""
+    """Make the trainer of a network and its optimizer on a mesh, from shapes alone."""
     shapes = jax.eval_shape(lambda params: _init(spec, params), network_shapes(spec.network))
     return Trainer(spec, mesh, network_graph(spec.network), place_shapes(shapes, mesh), codec)
 
 
 def _init(spec: TrainSpec, start: Any) -> TrainState:
-    """Make the state of step 0 from loaded parameters, or from random ones where there are none."""
+    """Make the state of step 0 from the given or random parameters."""
     params = nnx.state(WorldModel(spec.network), nnx.Param) if start is None else start
     base, learned = None, params
     if spec.lora_rank:
@@ -231,18 +216,18 @@ def _init(spec: TrainSpec, start: Any) -> TrainState:
 
 
 def list_shardings(shapes: Any) -> Any:
-    """The shardings of shapes that have them, in the same tree."""
+    """The shardings of a tree of shapes."""
     return jax.tree.map(lambda leaf: leaf.sharding, shapes)
 
 
 def sample_pairs(keys: Array, latents: Array, shift: float) -> TrainingPair:
-    """Make the `training_pair` of each sample of latents [b t h w c], with its own key [b]."""
+    """The `training_pair` of each sample of latents [b t h w c], with its own key [b]."""
     pairs = jax.vmap(lambda key, sample: training_pair(key, sample[None], shift))(keys, latents)
     return jax.tree.map(lambda leaf: leaf[:, 0], pairs)
 
 
 def add_history_noise(keys: Array, chunk: Batch, strength: float) -> Batch:
-    """Add noise to the earlier frames [b t h w c] of a chunk, if it has any: a rollout's are its own predictions."""
+    """Add noise to the earlier frames [b t h w c] of a chunk if it has any, because a rollout's are predictions."""
     if "history" not in chunk.conditions or not strength:
         return chunk
     history = chunk.conditions["history"]
@@ -252,16 +237,13 @@ def add_history_noise(keys: Array, chunk: Batch, strength: float) -> Batch:
 
 
 def estimate_clean(latents: Array, pair: TrainingPair, predicted: Array) -> Array:
-    """Estimate the clean latents [b t h w c] in one step from a predicted velocity [b t h w c].
-
-    Frame 0 of the estimate is the given one [b t h w c].
-    """
+    """Estimate the clean latents [b t h w c] in one step from a predicted velocity [b t h w c]; frame 0 is the given one."""
     clean = pair.noisy - pair.sigma[:, None, None, None, None] * predicted
     return put_first(clean, latents[:, :1])
 
 
 def chunk_weights(batch: Batch) -> Array:
-    """Each chunk's share [b k] in its sample's loss: equal over those that show the episode beyond their first frame."""
+    """Each chunk's weight [b k] in its sample's loss: equal over chunks with valid frames after the first."""
     if batch.following is None:
         return jnp.ones((len(batch.latents), 1), jnp.float32)
     later = batch.following.valid[:, 1:].any(axis=1).astype(jnp.float32)
@@ -270,7 +252,7 @@ def chunk_weights(batch: Batch) -> Array:
 
 
 def cut_samples(leaf: Array, parts: int) -> Array:
-    """Cut [b ...] into [parts b/parts ...]: part i has samples i, i + parts, …, so that every device keeps its own."""
+    """Cut [b ...] into [parts b/parts ...]: part i has samples i, i + parts, …, so samples stay on their devices."""
     return leaf.reshape(-1, parts, *leaf.shape[1:]).swapaxes(0, 1)
 
 

@@ -1,3 +1,3 @@
-"""Pixels of episodes: where they come from, how the camera's frames become the model's and back, and videos compared."""
+"""Pixels of episodes: their sources, conversion between the camera's and the model's frames, and comparison of videos."""
 
 __all__ = ["comparison", "frames", "pixels"]

@@ -1,4 +1,4 @@
-"""Two videos side by side, and their PSNR; for watching training only."""
+"""Comparison of two videos, for monitoring training."""
 
 import numpy as np
 
@@ -13,6 +13,6 @@ def strip(truth: np.ndarray, predicted: np.ndarray) -> np.ndarray:
 
 
 def psnr(predicted: np.ndarray, truth: np.ndarray) -> float:
-    """Mean PSNR [dB] over frames of two videos [t h w 3] uint8, for watching training only; the study's is in xew.metrics."""
+    """Mean PSNR [dB] over frames of two videos [t h w 3] uint8; `xew.metrics.psnr` is the study's metric."""
     error = np.square(predicted.astype(np.float32) - truth).mean(axis=(1, 2, 3))
     return float((10 * np.log10(255**2 / np.maximum(error, 1e-6))).mean())

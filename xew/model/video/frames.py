@@ -1,6 +1,6 @@
-"""Between the camera's frames and the model's: pad to the model's aspect ratio by repeating edges, then resize.
+"""Conversion between the camera's and the model's frames: pad to the aspect ratio by repeating edges, then resize.
 
-320x240 becomes 320x256 by eight rows above and below, and 160x128 by halving that; the way back is exact in geometry.
+For example, 320x240 becomes 320x256 by eight rows above and below, and then 160x128 by resizing.
 """
 
 from typing import NamedTuple
@@ -15,7 +15,7 @@ TEMPORAL_FACTOR = 4
 
 
 class Padding(NamedTuple):
-    """Rows or columns added before resizing [pixels of the camera]."""
+    """Numbers of rows and columns added before resizing [pixels of the camera]."""
 
     top: int
     bottom: int
@@ -24,7 +24,7 @@ class Padding(NamedTuple):
 
 
 def padding_to(height: int, width: int) -> Padding:
-    """What brings a camera frame to the aspect ratio of height x width."""
+    """Padding of a camera frame to the aspect ratio of height x width."""
     rows = max(0, round(WIDTH * height / width) - HEIGHT)
     columns = max(0, round(HEIGHT * width / height) - WIDTH)
     return Padding(rows // 2, rows - rows // 2, columns // 2, columns - columns // 2)

@@ -1,6 +1,6 @@
-"""Checkpoints of other projects: their tensors into our modules, and our modules out under their names.
+"""Reading and writing checkpoints in the formats of other projects.
 
-A module's `Layout` says for each of its leaves which tensors it comes from and how their axes are ordered.
+A module's `Layout` gives for each of its leaves the names of its tensors and the order of their axes.
 """
 
 __all__ = ["filling", "layout", "reading", "writing"]

@@ -1,10 +1,4 @@
-"""The leaves of a module from a checkpoint: whether its tensors fit, and filling them in.
-
-Reads  `Tensors`, by the module's `Layout`
-Writes the leaves of the module
-
-Tensors are read one at a time, so that a checkpoint of 20 GB is never held twice.
-"""
+"""Filling the leaves of a module from a checkpoint, one tensor at a time to save memory."""
 
 from collections.abc import Collection
 from fnmatch import fnmatchcase
@@ -20,19 +14,22 @@ from xew.model.weights.reading import Tensors
 
 
 def fill(module: nnx.Module, tensors: Tensors, layout: Layout, *, optional: Collection[str] = ()) -> None:
-    """Fill the leaves of a module in place from a checkpoint, in each leaf's own type and on its own devices.
+    """Fill the leaves of a module in place from a checkpoint, in each leaf's type and on its devices.
 
-    Leaves that the layout does not name keep their values. An abstract module (of `nnx.eval_shape`) becomes a real one
-    but for such leaves.
+    Leaves outside the layout keep their values; other leaves of an abstract module (of `nnx.eval_shape`) become real.
 
-    The patterns in `optional`, as "flow_stream.*", are of leaves that the checkpoint may lack and of its keys that may be left.
+    Args:
+        module: to fill.
+        tensors: of the checkpoint.
+        layout: of the module's leaves in the checkpoint.
+        optional: patterns, as "flow_stream.*", of leaves that the checkpoint may lack and of keys that are ignored.
 
     Raises:
-        ConfigError: tensors are missing, left over or misshapen; the first few are named. Nothing has been filled then.
+        ConfigError: tensors are missing, left over or misshapen; nothing is filled then.
     """
-    wanted = check_fit(module, tensors, layout, optional=optional)
+    filled = check_fit(module, tensors, layout, optional=optional)
     leaves = module_leaves(module, layout)
-    for path, source in wanted.items():
+    for path, source in filled.items():
         variable = leaves[path]
         value = _leaf_value(tensors, source, variable.shape, np.dtype(variable.dtype))
         if jax.numpy.issubdtype(value.dtype, jax.numpy.inexact) and not np.isfinite(value).all():
@@ -42,31 +39,30 @@ def fill(module: nnx.Module, tensors: Tensors, layout: Layout, *, optional: Coll
 
 def check_fit(module: nnx.Module, tensors: Tensors, layout: Layout, *, optional: Collection[str] = ()) -> Layout:
     """The leaves that `fill` would fill; raises its errors without reading a tensor."""
-    wanted = {path: source for path, source in layout.items() if not _keeps_its_value(path, source, tensors, optional)}
-    taken = {key for source in layout.values() for key in source.keys}
-    foreign = [key for key in tensors if key not in taken and not _matches(key, optional)]
-    missing = [f"{key} (for {path})" for path, source in wanted.items() for key in source.keys if key not in tensors]
+    filled = {
+        path: source
+        for path, source in layout.items()
+        if not _matches(path, optional) or any(key in tensors for key in source.keys)
+    }
+    known = {key for source in layout.values() for key in source.keys}
+    foreign = [key for key in tensors if key not in known and not _matches(key, optional)]
+    missing = [f"{key} (for {path})" for path, source in filled.items() for key in source.keys if key not in tensors]
     leaves = module_leaves(module, layout)
     misshapen = [
         f"{key} is {list(tensors.shape(key))}, the model's {path} needs {list(shape)}"
-        for path, source in wanted.items()
+        for path, source in filled.items()
         for shape in (tensor_shape(leaves[path].shape, source),)
         for key in source.keys
         if key in tensors and tensors.shape(key) != shape
     ]
     faults = {"missing": missing, "of another shape": misshapen, "not of this model": foreign}
-    found = [f"{len(names)} {kind}: {list_some(names)}" for kind, names in faults.items() if names]
-    if found:
+    differences = [f"{len(names)} {kind}: {list_some(names)}" for kind, names in faults.items() if names]
+    if differences:
         raise ConfigError(
-            f"{tensors.source} does not fit the model: " + "; ".join(found) + ". Choose the model size that it was trained"
-            " with, or another file."
+            f"{tensors.source} does not fit the model: {'; '.join(differences)}. Choose the model size of the weights, or "
+            "another file."
         )
-    return wanted
-
-
-def _keeps_its_value(path: str, source: Source, tensors: Tensors, optional: Collection[str]) -> bool:
-    """Whether a leaf is to keep its value: optional, and the checkpoint has none of its tensors."""
-    return _matches(path, optional) and not any(key in tensors for key in source.keys)
+    return filled
 
 
 def _matches(name: str, patterns: Collection[str]) -> bool:
@@ -74,15 +70,15 @@ def _matches(name: str, patterns: Collection[str]) -> bool:
 
 
 def _leaf_value(tensors: Tensors, source: Source, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
-    """A leaf of `shape` from its tensors: each is read, converted into its place, and let go."""
+    """Read a leaf of `shape` [...] from its tensors."""
     value = np.empty(shape, dtype)
-    for place, key in zip(value if source.is_stacked else (value,), source.keys, strict=True):
-        np.copyto(place, AXES[source.layout].to_leaf(tensors[key], source.kernel), casting="unsafe")
+    for layer, key in zip(value if source.is_stacked else (value,), source.keys, strict=True):
+        np.copyto(layer, AXES[source.layout].to_leaf(tensors[key], source.kernel), casting="unsafe")
     return value
 
 
 def _place(value: np.ndarray, like: Any) -> jax.Array:
-    """Put a value where the leaf lay before; each process gives its own devices their shards."""
+    """Place a value [...] with the sharding of the previous one."""
     sharding = getattr(like, "sharding", None)
     if sharding is None:
         return jax.device_put(value)

@@ -1,10 +1,4 @@
-"""Where the leaves of a module lie in somebody's checkpoint, and how the axes of tensors and leaves differ.
-
-Reads  a module and a `Layout`
-Writes its leaves by path, and the keys and shapes of the tensors that they come from
-
-filling.py and writing.py go in either direction with it.
-"""
+"""Layouts of modules in checkpoints: keys of tensors, and the order of their axes."""
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
@@ -14,17 +8,17 @@ import numpy as np
 from flax import nnx
 
 LISTED = 6
-"""Number of faults of a kind that an error names."""
+"""Number of names that an error lists."""
 
 
 @dataclass(frozen=True)
 class Source:
-    """Place of one leaf of a module in somebody's checkpoint."""
+    """Tensors of one leaf in a checkpoint."""
 
     keys: tuple[str, ...]
-    """Key of one tensor, or a key for each layer; `stacked` says which."""
+    """Key of the tensor, or of the tensor of each layer if `is_stacked`."""
     layout: Literal["as_is", "linear", "conv", "patches", "ones", "leading_ones"] = "as_is"
-    """Way in which the tensor's axes become the leaf's.
+    """Conversion of the tensor's axes to the leaf's:
 
     as_is    unchanged
     linear   [out in] -> [in out]
@@ -36,7 +30,7 @@ class Source:
     kernel: tuple[int, ...] = ()
     """Shape of the kernel of `patches`, or of the ones of `ones` and `leading_ones`."""
     stacked: bool | None = None
-    """Whether layers are stacked on the leading axis; by default so if there are several keys."""
+    """Whether layers are stacked on the leading axis (default: if there are several keys)."""
 
     @property
     def is_stacked(self) -> bool:
@@ -45,17 +39,17 @@ class Source:
 
 
 Layout = Mapping[str, Source]
-"""Place of each leaf in a checkpoint by its path, as "blocks.self_attn.q.kernel"."""
+"""Source of each leaf by path, as "blocks.self_attn.q.kernel"."""
 
 
 def checkpoint_shapes(module: nnx.Module, layout: Layout) -> dict[str, tuple[int, ...]]:
-    """Shape of every tensor that the layout asks for, by key; works on modules of `nnx.eval_shape`."""
+    """Shape of every tensor of the layout by key; the module may be abstract (of `nnx.eval_shape`)."""
     leaves = module_leaves(module, layout)
     return {key: tensor_shape(leaves[path].shape, source) for path, source in layout.items() for key in source.keys}
 
 
 def module_leaves(module: nnx.Module, layout: Layout) -> dict[str, nnx.Variable]:
-    """The leaves of a module by path. Raises ValueError if the layout names others, or another number of layers."""
+    """The leaves of a module by path. Raises ValueError if the layout names other leaves or numbers of layers."""
     leaves = {".".join(map(str, path)): leaf for path, leaf in nnx.to_flat_state(nnx.state(module))}
     unknown = [path for path in layout if path not in leaves]
     if unknown:
@@ -68,18 +62,16 @@ def module_leaves(module: nnx.Module, layout: Layout) -> dict[str, nnx.Variable]
 
 
 def tensor_shape(leaf: tuple[int, ...], source: Source) -> tuple[int, ...]:
-    """Shape of one of the source's tensors for a leaf of this shape (views of one number: nothing is allocated)."""
+    """Shape of each of the source's tensors for a leaf of this shape."""
     shape = leaf[1:] if source.is_stacked else leaf
     return AXES[source.layout].to_tensor(np.broadcast_to(np.float32(0), shape), source.kernel).shape
 
 
 class Axes(NamedTuple):
-    """The two directions of one way of ordering axes; both functions take the kernel of the source too."""
+    """Conversion of axes in both directions; both functions also take the source's kernel."""
 
     to_leaf: Callable[[np.ndarray, tuple[int, ...]], np.ndarray]
-    """Function from a tensor to a leaf."""
     to_tensor: Callable[[np.ndarray, tuple[int, ...]], np.ndarray]
-    """Function from a leaf to a tensor."""
 
 
 def _split_patches(leaf: np.ndarray, kernel: tuple[int, ...]) -> np.ndarray:
@@ -106,7 +98,7 @@ AXES: dict[str, Axes] = {
 
 
 def list_some(names: Iterable[str]) -> str:
-    """The first few names, and how many more there are."""
+    """The first few names, and the number of others."""
     names = list(names)
     more = f" and {len(names) - LISTED} more" if len(names) > LISTED else ""
     return ", ".join(names[:LISTED]) + more

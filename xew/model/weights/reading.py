@@ -1,11 +1,4 @@
-"""Checkpoints of other projects: their files, opened as `Tensors` by key.
-
-Reads  .safetensors, *.safetensors.index.json, a folder of either, .pth and .pt (PyTorch state dicts, `weights_only`), and
-       config.json next to them
-Writes `Tensors`, each of which is read when it is asked for
-
-Nothing is ever unpickled freely.
-"""
+"""Opening checkpoints of other projects as `Tensors` by key, read lazily and never unpickled without `weights_only`."""
 
 import pickle
 import zipfile
@@ -24,9 +17,9 @@ from xew.files import read_json
 from xew.model.weights.layout import list_some
 
 PREFIXES = ("pipe.dit.", "pipe.", "model.diffusion_model.", "model.", "module.")
-"""Names of wrappers in front of keys, taken off (the longest that fits)."""
+"""Prefixes of wrappers, removed from keys (the first that matches)."""
 STATE_DICTS = ("state_dict", "model_state_dict", "model")
-"""Names under which a .pth may hold its tensors one level down."""
+"""Keys of a nested state dict in a .pth."""
 
 
 @dataclass(frozen=True)
@@ -39,9 +32,9 @@ class Entry:
 
 
 class Tensors(Mapping):
-    """Tensors of a checkpoint by key; each is read when it is asked for.
+    """Tensors of a checkpoint by key, read lazily.
 
-    The mapping has no type parameters: to check them at run time would read a tensor.
+    The mapping has no type parameters, because checking them at run time would read a tensor.
     """
 
     def __init__(self, entries: Mapping[str, Entry], source: Path) -> None:
@@ -65,28 +58,25 @@ class Tensors(Mapping):
 
     @property
     def config(self) -> dict[str, Any]:
-        """What config.json next to the checkpoint says, as diffusers writes one; nothing where there is none.
-
-        Raises ConfigError if it is broken.
-        """
+        """Content of config.json next to the checkpoint, as in diffusers, or {}. Raises ConfigError if it is broken."""
         config = (self.source if self.source.is_dir() else self.source.parent) / "config.json"
         if not config.exists():
             return {}
         try:
             content = read_json(config)
         except (OSError, ValueError) as error:
-            raise ConfigError(f"{config} cannot be read: {error}; get it again, or take it away.") from error
+            raise ConfigError(f"{config} cannot be read: {error}; download it again, or delete it.") from error
         if not isinstance(content, dict):
-            raise ConfigError(f"{config} holds a {type(content).__name__}, expected keys and values; get it again.")
+            raise ConfigError(f"{config} holds a {type(content).__name__}, expected keys and values; download it again.")
         return content
 
 
 def read_tensors(path: Path) -> Tensors:
-    """Open a checkpoint: numpy arrays by key (bfloat16 as of ml_dtypes), read lazily; wrappers' prefixes are taken off.
+    """Open a checkpoint: NumPy arrays by key (bfloat16 of ml_dtypes), without the prefixes of wrappers.
 
     Args:
         path: a .safetensors file, a *.safetensors.index.json, a folder that holds either, or a .pth / .pt state dict
-            (needs PyTorch; loaded with `weights_only`, so that it can hold nothing but tensors).
+            (needs PyTorch; loaded with `weights_only`).
 
     Raises:
         ConfigError: there is no such file, it is broken, or it is of another kind.
@@ -95,19 +85,19 @@ def read_tensors(path: Path) -> Tensors:
     try:
         return Tensors(_strip_prefixes(_open(path), path), path)
     except SafetensorError as error:
-        raise ConfigError(f"{path} is no whole safetensors file ({error}); download it again.") from error
+        raise ConfigError(f"{path} is not a whole safetensors file ({error}); download it again.") from error
     except OSError as error:
         raise ConfigError(f"cannot read the weights {path}: {error.strerror or error}.") from error
 
 
 def _read_torch(tensor: Any) -> np.ndarray:
-    """A tensor [...] of PyTorch as NumPy's."""
+    """Convert a tensor [...] of PyTorch to NumPy."""
     tensor = tensor.detach()
     if str(tensor.dtype) != "torch.bfloat16":
         return tensor.numpy()
     import torch
 
-    return tensor.contiguous().view(torch.uint16).numpy().view(ml_dtypes.bfloat16)  # NumPy has no such type: the same bits
+    return tensor.contiguous().view(torch.uint16).numpy().view(ml_dtypes.bfloat16)
 
 
 def _open(path: Path) -> dict[str, Entry]:
@@ -121,13 +111,11 @@ def _open(path: Path) -> dict[str, Entry]:
         return _open_safetensors(path)
     if path.suffix in (".pth", ".pt"):
         return _open_torch(path)
-    raise ConfigError(
-        f"{path} is no checkpoint that is known here; expected .safetensors, .safetensors.index.json, .pth or .pt."
-    )
+    raise ConfigError(f"{path} is not a known kind of checkpoint; expected .safetensors, .safetensors.index.json, .pth or .pt.")
 
 
 def _open_folder(folder: Path) -> dict[str, Entry]:
-    """Open a folder by its index if there is one; else all its .safetensors; else its only .pth."""
+    """Open a folder by its index, else all its .safetensors, else its only .pth."""
     indexes, shards = sorted(folder.glob("*.safetensors.index.json")), sorted(folder.glob("*.safetensors"))
     pickles = sorted(file for file in folder.iterdir() if file.suffix in (".pth", ".pt"))
     if len(indexes) == 1:
@@ -136,13 +124,13 @@ def _open_folder(folder: Path) -> dict[str, Entry]:
         return _merge((shard, _open_safetensors(shard)) for shard in shards)
     if not indexes and len(pickles) == 1:
         return _open_torch(pickles[0])
-    choices = [file.name for file in (*indexes, *pickles)]
-    found = f"several checkpoints ({', '.join(choices)}); name one of them" if choices else "no .safetensors, .pth or .pt"
-    raise ConfigError(f"{folder} holds {found}.")
+    names = [file.name for file in (*indexes, *pickles)]
+    content = f"several checkpoints ({', '.join(names)}); name one of them" if names else "no .safetensors, .pth or .pt"
+    raise ConfigError(f"{folder} holds {content}.")
 
 
 def _open_index(index: Path) -> dict[str, Entry]:
-    """Open the shards that an index names; they lie next to it, and a path that leads elsewhere is refused."""
+    """Open the shards of an index, which must be next to it."""
     try:
         names = read_json(index)["weight_map"]
         shards = sorted(set(names.values()))
@@ -155,7 +143,7 @@ def _open_index(index: Path) -> dict[str, Entry]:
         )
     absent = [name for name in shards if not (index.parent / name).is_file()]
     if absent:
-        raise ConfigError(f"{index} names shards that are not there: {list_some(absent)}; download them into {index.parent}.")
+        raise ConfigError(f"{index} names missing shards: {list_some(absent)}; download them into {index.parent}.")
     entries = _merge((index.parent / name, _open_safetensors(index.parent / name)) for name in shards)
     lost = [key for key in names if key not in entries]
     if lost:
@@ -167,7 +155,7 @@ def _open_safetensors(path: Path) -> dict[str, Entry]:
     try:
         file = safe_open(path, framework="numpy")
     except SafetensorError as error:
-        raise ConfigError(f"{path} is no whole safetensors file ({error}); download it again.") from error
+        raise ConfigError(f"{path} is not a whole safetensors file ({error}); download it again.") from error
     shapes = {key: tuple(file.get_slice(key).get_shape()) for key in file.keys()}  # noqa: SIM118 (no mapping)
     return {key: Entry(shape, partial(file.get_tensor, key)) for key, shape in shapes.items()}
 
@@ -180,12 +168,11 @@ def _open_torch(path: Path) -> dict[str, Entry]:
     try:
         content = torch.load(path, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(path))
     except pickle.UnpicklingError as error:
-        raise ConfigError(
-            f"{path} holds more than tensors, or is broken, and is not opened; get it as .safetensors."
-        ) from error
+        raise ConfigError(f"{path} holds more than tensors, or is broken; get it as .safetensors.") from error
     except (RuntimeError, EOFError, ValueError) as error:
-        raise ConfigError(f"{path} is no whole PyTorch file ({str(error).splitlines()[0]}); download it again.") from error
-    state = _state_dict(content)
+        raise ConfigError(f"{path} is not a whole PyTorch file ({str(error).splitlines()[0]}); download it again.") from error
+    state = content if isinstance(content, Mapping) else {}
+    state = next((state[name] for name in STATE_DICTS if isinstance(state.get(name), Mapping)), state)
     tensors = {
         str(key): Entry(tuple(value.shape), partial(_read_torch, value))
         for key, value in state.items()
@@ -194,14 +181,6 @@ def _open_torch(path: Path) -> dict[str, Entry]:
     if not tensors:
         raise ConfigError(f"{path} holds no tensors by name; expected a state dict.")
     return tensors
-
-
-def _state_dict(content: Any) -> Mapping[str, Any]:
-    """The mapping of names to tensors in what a .pth holds."""
-    if not isinstance(content, Mapping):
-        return {}
-    inner = [content[name] for name in STATE_DICTS if isinstance(content.get(name), Mapping)]
-    return inner[0] if inner else content
 
 
 def _merge(files: Iterable[tuple[Path, Mapping[str, Entry]]]) -> dict[str, Entry]:

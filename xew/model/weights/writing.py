@@ -1,8 +1,4 @@
-"""Our modules into checkpoints of other projects.
-
-Reads  the leaves of a module, by its `Layout`
-Writes .safetensors, or a folder of shards with their index
-"""
+"""Writing modules as checkpoints of other projects: .safetensors, or a folder of shards with their index."""
 
 import itertools
 import json
@@ -21,14 +17,13 @@ from xew.files import replacing, write_text
 from xew.model.weights.layout import AXES, Layout, module_leaves, tensor_shape
 
 SHARD_BYTES = 5_000_000_000
-"""Number of bytes that a shard may hold."""
+"""Largest size of a shard [bytes]."""
 
 
 def save_weights(module: nnx.Module, path: Path, layout: Layout) -> None:
-    """Write a module's leaves, each in its own type, under another project's names: the inverse of loading.
+    """Write a module's leaves, each in its type, under the names of a layout.
 
-    A path that does not end in .safetensors is a folder, which gets shards of at most 5 GB and their index under the names
-    that diffusers looks for.
+    A path that does not end in .safetensors becomes a folder of shards of at most 5 GB and their index, with diffusers' names.
 
     Raises:
         ConfigError: the file cannot be written.
@@ -47,7 +42,7 @@ def save_weights(module: nnx.Module, path: Path, layout: Layout) -> None:
 
 
 def _convert(leaves: Mapping[str, nnx.Variable], layout: Layout) -> Iterator[tuple[str, np.ndarray]]:
-    """Every tensor with its key; a leaf comes from the device once, for all its layers."""
+    """Every key and tensor; a leaf is copied from the device once for all its layers."""
     for path, source in layout.items():
         value = np.asarray(jax.device_get(leaves[path].get_value()))
         for key, layer in zip(source.keys, value if source.is_stacked else (value,), strict=True):
@@ -55,16 +50,16 @@ def _convert(leaves: Mapping[str, nnx.Variable], layout: Layout) -> Iterator[tup
 
 
 def _write(path: Path, tensors: dict[str, np.ndarray]) -> None:
-    """Write all of a file or nothing of it."""
+    """Write a file atomically, with the user's default permissions."""
     with replacing(path) as partial:
         save_file(tensors, partial, metadata={"format": "pt"})
-        mask = os.umask(0)  # the library lets nobody else read its files; ours are as readable as any of this user's
+        mask = os.umask(0)  # the library's files are readable by their owner only
         os.umask(mask)
         partial.chmod(0o666 & ~mask)
 
 
 def _write_shards(folder: Path, leaves: Mapping[str, nnx.Variable], layout: Layout) -> None:
-    """Write shards as they fill up; their names say how many there are, so the plan comes first. The index comes last."""
+    """Write shards, then their index; names hold the number of shards, so they are planned first."""
     sizes = {
         key: int(np.prod(tensor_shape(leaves[path].shape, source))) * np.dtype(leaves[path].dtype).itemsize
         for path, source in layout.items()
@@ -80,10 +75,10 @@ def _write_shards(folder: Path, leaves: Mapping[str, nnx.Variable], layout: Layo
 
 
 def _plan_shards(sizes: Mapping[str, int], limit: int) -> dict[str, int]:
-    """The shard of each tensor, in order, none above the limit unless one tensor is."""
-    plan, shard, held = {}, 0, 0
+    """The shard of each tensor, in order; a shard exceeds the limit only for a single larger tensor."""
+    plan, shard, total = {}, 0, 0
     for key, size in sizes.items():
-        if held and held + size > limit:
-            shard, held = shard + 1, 0
-        plan[key], held = shard, held + size
+        if total and total + size > limit:
+            shard, total = shard + 1, 0
+        plan[key], total = shard, total + size
     return plan
