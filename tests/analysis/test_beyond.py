@@ -336,7 +336,7 @@ def test_the_report_sets_both_motions_side_by_side(both_motions: tuple[Path, Pat
     main(Args(both_motions[0], other_motion=both_motions[1], out=tmp_path))
     text = (tmp_path / "report.md").read_text()
     assert "## Shared and own motion" in text and "one tool path" in text
-    for robot in ("Franka Panda", "Piper"):
+    for robot in ("Franka (Panda)", "Piper"):
         joints = "+100\u00a0% (+100\u00a0% to +100\u00a0%) with joint pose, +0\u00a0% (+0\u00a0% to +0\u00a0%) with ray map"
         assert f"- Where each robot moves in its own way, LPIPS on {robot} differs by {joints}" in text
     assert "Shared and own motion" in (tmp_path / "index.html").read_text()

@@ -32,9 +32,11 @@ from xew.analysis.paper import read_paper
 from xew.analysis.reports import page, pictures
 from xew.analysis.reports import paper as paper_report
 from xew.analysis.reports import study as report_study
+from xew.analysis.reports.answer import answer, answer_strip, best_row, run_contests
 from xew.analysis.reports.charts import Chart, chart_files
 from xew.analysis.reports.run_tables import RobotTable, Row, finding, flat_summary, robot_table
 from xew.analysis.reports.study_charts import run_chart
+from xew.analysis.reports.study_strips import Strip
 from xew.analysis.reports.study_text import curves_note, missing_note
 from xew.analysis.scores import TRUTH, MetricInfo, Scores, find_missing_scores, read_scores
 from xew.analysis.tables import formats
@@ -72,6 +74,10 @@ FILES = ("index.html", "report.md", "*.csv", "figures/*", "tables/*")
 """Patterns of the paths of what is written into the folder of a report."""
 NO_FILE_NAME = re.compile(r"[<>\"/\\|?*()\[\]`']+")
 """Letters of the names of models that stand in no name of a figure's file."""
+Rollouts = Mapping[tuple[str, str, str, int, str], Rollout]
+"""Rollouts by model, condition, task, seed and robot."""
+MIDDLE = ("median", "the only episode")
+"""Names of the middle one of ranked episodes."""
 EXPLORER = "explorer/index.html"
 """Path of the explorer's page below the report's folder."""
 
@@ -184,7 +190,9 @@ def _report_scores(args: Args, scores: Scores) -> None:
     held_out, seen = _make_tables(scores, records, args.held_out)
     missing = find_missing_scores(scores.rows)
     notes = [*missing_note(missing), *curves_note(scores)]
-    strips = _make_strips(scores, args) if args.data and args.rollouts else []
+    rollouts = {(r.model, r.condition, r.task, r.seed, r.robot): r for root in args.rollouts for r in find_rollouts(root)}
+    strips = _make_strips(scores, args, rollouts) if args.data and args.rollouts else []
+    first = answer(list(run_contests(held_out)), _make_answer_strip(scores, args, held_out, rollouts))
     if args.explorer:
         _write_explorer(scores, args)
     curves = _curve_chart(scores, args.held_out)
@@ -197,9 +205,10 @@ def _report_scores(args: Args, scores: Scores) -> None:
         _method_section(scores, args),
     ]
     sentences = finding(held_out, seen, scores.metrics)
-    html = page.page(TITLE, sentences, [part for part in sections if part], _format_footer(scores.versions))
+    html = page.page(TITLE, sentences, [part for part in sections if part], _format_footer(scores.versions), first)
     notes += _caution_notes(held_out)
-    text, files = _write_markdown(sentences, notes, held_out, seen, scores, strips, chart_files(curves))
+    drawn = chart_files(curves) | (chart_files(first.chart) if first.chart else {})
+    text, files = _write_markdown([first.sentence, *sentences], notes, held_out, seen, scores, strips, drawn)
     if len(missing):
         files["missing.csv"] = csv_text(missing).encode()
     _write_report(args.out, html, (text, files), flat_summary(held_out + seen, scores.metrics))
@@ -355,10 +364,21 @@ def _write_explorer(scores: Scores, args: Args) -> None:
         write_page(Page(TITLE, scenes, left_out, predictions, flow=False, given=given), (args.out / EXPLORER).parent)
 
 
-def _make_strips(scores: Scores, args: Args) -> list[Picture]:
+def _make_answer_strip(scores: Scores, args: Args, tables: Sequence[RobotTable], rollouts: Rollouts) -> Strip | None:
+    """Make the first screen's picture, of the best model's median episode on each held-out robot."""
+    episodes: dict[str, tuple[Path, Rollout]] = {}
+    for word, row in _choose_episodes(scores, args.held_out) if args.data else ():
+        title = robot_title(row["robot"])
+        best = next((best_row(table) for table in tables if table.title == title), None)
+        key = _rollout_key(row)
+        if args.data and best and word in MIDDLE and key[:2] == (best.model, best.condition) and key in rollouts:
+            episodes[title] = episode_folder(args.data, *key[2:]), rollouts[key]
+    return answer_strip(episodes, scores.frame_zero)
+
+
+def _make_strips(scores: Scores, args: Args, rollouts: Rollouts) -> list[Picture]:
     """Make the strips of the chosen episodes."""
     assert args.data is not None
-    rollouts = {(r.model, r.condition, r.task, r.seed, r.robot): r for root in args.rollouts for r in find_rollouts(root)}
     shown = tqdm(_choose_episodes(scores, args.held_out), desc="strips", unit="strip", disable=None)
     return [_make_strip(row, word, rollouts, args.data, scores.frame_zero) for word, row in shown]
 
@@ -366,16 +386,18 @@ def _make_strips(scores: Scores, args: Args) -> list[Picture]:
 def _rank_episodes(group: pd.DataFrame) -> list[tuple[str, pd.Series]]:
     """Best, median and worst row by the ranking metric (lower is better); fewer where there are fewer."""
     if len(group) == 1:
-        return [("the only episode", group.iloc[0])]
+        return [(MIDDLE[1], group.iloc[0])]
     ordered = group.sort_values(["value", "task", "seed"])
-    places = {0: "best", len(ordered) // 2: "median", len(ordered) - 1: "worst"}
-    return [(word, ordered.iloc[place]) for place, word in sorted(places.items())]
+    words = {0: "best", len(ordered) // 2: MIDDLE[0], len(ordered) - 1: "worst"}
+    return [(word, ordered.iloc[rank]) for rank, word in sorted(words.items())]
 
 
-def _make_strip(
-    row: pd.Series, word: str, rollouts: dict[tuple[str, str, str, int, str], Rollout], data: Path, frame_zero: str
-) -> Picture:
-    key = (row["model"], row["condition"], row["task"], int(row["seed"]), row["robot"])
+def _rollout_key(row: pd.Series) -> tuple[str, str, str, int, str]:
+    return row["model"], row["condition"], row["task"], int(row["seed"]), row["robot"]
+
+
+def _make_strip(row: pd.Series, word: str, rollouts: Rollouts, data: Path, frame_zero: str) -> Picture:
+    key = _rollout_key(row)
     if key not in rollouts:
         raise ConfigError(f"the rollout {' '.join(map(str, key))} is graded but not under --rollouts; name its tree too.")
     observed = read_video(episode_folder(data, *key[2:]) / "rgb.mkv")

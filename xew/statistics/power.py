@@ -62,8 +62,8 @@ def describe_power(power: pd.DataFrame, titles: Mapping[str, str]) -> str:
         tasks.setdefault(titles.get(metric, metric), []).append(task)
     if not tasks:
         return ""
-    found = "; ".join(f"{metric}: {', '.join(names)}" for metric, names in tasks.items())
+    left_out = "; ".join(f"{metric}: {', '.join(names)}" for metric, names in tasks.items())
     return (
-        f"Tasks without power, in which the frozen first frame is less than {LEAST_POWER:g} times as far from the best as the "
-        f"true video, leave the mean of {found}."
+        f"Means leave out tasks without power, where the frozen first frame is less than {LEAST_POWER:g} times as far from the "
+        f"best score as the true video ({left_out})."
     )

@@ -68,10 +68,11 @@ def describe_floors(models: Sequence[str], codecs: Mapping[str, Sequence[str]]) 
     for model in models:
         by_key.setdefault(tuple(codecs.get(model, ())), []).append(model)
     without = by_key.pop((), [])
-    softened = "of the true video, softened by a blur, since the truth was not graded through a codec"
+    blurred = "the true video after a blur, because the truth was not graded through a codec"
     if not by_key:
-        return f"Noise floors are {softened}." if without else ""
+        return f"Noise floors come from {blurred}." if without else ""
     if not without and len(by_key) == 1:
-        return f"Noise floors are of the truth through the models' {' and '.join(next(iter(by_key)))}."
-    parts = [f"{', '.join(names)}: of the truth through {' and '.join(key)}" for key, names in by_key.items()]
-    return f"Noise floors are, of {'; '.join(parts)}" + (f"; {', '.join(without)}: {softened}." if without else ".")
+        return f"Noise floors come from the truth through the models' {' and '.join(next(iter(by_key)))}."
+    parts = [f"the truth through {' and '.join(key)} (for {', '.join(names)})" for key, names in by_key.items()]
+    parts += [f"{blurred} (for {', '.join(without)})"] if without else []
+    return f"Noise floors come from {'; '.join(parts)}."

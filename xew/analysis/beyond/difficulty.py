@@ -15,9 +15,9 @@ from scipy.stats import BootstrapMethod, PermutationMethod, pearsonr
 from xew.analysis.paper import AXES, PAPER_TITLES
 from xew.analysis.scores import COPY, MetricInfo
 from xew.analysis.statistics.grades import StudyGrades
-from xew.analysis.tables.distances import AXIS_TITLES, Distances, format_signed
+from xew.analysis.tables.distances import AXIS_TITLES, Distances
 from xew.analysis.tables.labels import PAPER_METRICS
-from xew.analysis.tables.table import Column, Table, TableCell, TableRow, TableSection
+from xew.analysis.tables.table import Column, Table, TableCell, TableRow, TableSection, format_signed
 from xew.protocol import DISTANCE_BODIES, PARTS, SPLITS
 from xew.statistics import DRAWS, LEVEL, holm
 

@@ -9,16 +9,14 @@ from itertools import groupby
 from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
-from markupsafe import Markup, escape
+from markupsafe import Markup
 
+from xew.analysis.reports import pictures
+from xew.analysis.reports.answer import Answer
 from xew.analysis.reports.charts import Chart, panel_svg, themed_color
+from xew.analysis.reports.study_strips import Strip
 from xew.analysis.tables.findings import Finding
 from xew.analysis.tables.table import Column, Table, TableRow
-
-__all__ = [
-    "Markup", "anchor", "chart", "claims", "contents", "definitions", "details", "escape", "labeled_picture", "link", "note",
-    "page", "paragraph", "section", "table",
-]  # fmt: skip
 
 MOST_COLUMNS = 10
 """Largest number of columns of values that stand beside one another on a page of 1400 pixels, unless one group has more."""
@@ -31,9 +29,15 @@ TEMPLATES = Environment(
 )
 
 
-def page(title: str, finding: Sequence[str], parts: Sequence[Markup], footer: str) -> str:
-    """The whole page: its findings as a list, then its sections."""
-    return TEMPLATES.get_template("page.html").render(title=title, finding=finding, parts=parts, footer=footer)
+def page(title: str, finding: Sequence[str], parts: Sequence[Markup], footer: str, first: Answer | None = None) -> str:
+    """The whole page: the first screen, the results as a list, then the sections."""
+    figures = []
+    if first and first.strip:
+        figures.append(strip(first.strip))
+    if first and first.chart:
+        figures.append(chart(first.chart))
+    values = {"title": title, "answer": first and first.sentence, "figures": figures, "finding": finding}
+    return TEMPLATES.get_template("page.html").render(**values, parts=parts, footer=footer)
 
 
 def section(title: str, *parts: Markup) -> Markup:
@@ -152,6 +156,11 @@ def labeled_picture(source: str, caption: str, columns: Sequence[str], rows: Seq
         title: beginning of the caption, if any.
     """
     return _render("figures.html", "labeled_picture", source, title, caption, columns, rows)
+
+
+def strip(shown: Strip) -> Markup:
+    """A sheet of frames with its labels and its caption."""
+    return labeled_picture(pictures.data_uri(shown.image), shown.caption, shown.columns, shown.rows)
 
 
 def claims(findings: Sequence[Finding], papers: Sequence[Finding] | None, by_paper: Sequence[Finding] | None = None) -> Markup:

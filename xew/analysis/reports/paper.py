@@ -14,12 +14,11 @@ from xew.analysis.tables.distances import (
     certainty_table,
     correlation_table,
     distance_tables,
-    format_signed,
     printed_distances,
 )
 from xew.analysis.tables.findings import FAILS, HOLDS, UNMEASURED, UNRESOLVED, Finding, ask
 from xew.analysis.tables.layouts import build_tables, count_table
-from xew.analysis.tables.table import TableCell
+from xew.analysis.tables.table import TableCell, format_signed
 
 TITLE = "The paper's figures, rebuilt from one another"
 PRIMARY = "lpips"
@@ -56,6 +55,7 @@ def build(paper: Paper, footer: str) -> Report:
     assert chart is not None  # all folds are printed
     content = Content(
         TITLE,
+        None,
         [*describe_correlations(paper), describe_claims(findings)],
         {"paper": findings},
         CLAIMS_TEXT,

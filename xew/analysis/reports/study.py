@@ -21,11 +21,12 @@ from xew.analysis.beyond import (
     scaling_table,
 )
 from xew.analysis.paper import AXES, read_paper
-from xew.analysis.reports import page, pictures
+from xew.analysis.reports import page
+from xew.analysis.reports.answer import Answer, answer, answer_strip, study_contests
 from xew.analysis.reports.charts import Chart, chart_files
 from xew.analysis.reports.study_beyond import charts_beyond
 from xew.analysis.reports.study_charts import study_charts
-from xew.analysis.reports.study_strips import Strip, study_strips
+from xew.analysis.reports.study_strips import Strip, find_videos, median_episodes, study_strips
 from xew.analysis.reports.study_text import curves_note, missing_note, part_notes, study_sentences, trainings_note
 from xew.analysis.scores import Scores, find_missing_scores
 from xew.analysis.statistics.grades import PaperGrades, StudyGrades
@@ -113,6 +114,8 @@ class Content:
     """Everything that the page and the Markdown show."""
 
     title: str
+    first: Answer | None
+    """First screen of the page; None leaves it out."""
     sentences: Sequence[str]
     findings: Mapping[str, Sequence[Finding]]
     """Answers to the claims by what they were asked of: HERE, BY_PAPER and PRINTED; the first decides. Empty where none was."""
@@ -157,7 +160,8 @@ def build(
     """
     paper = read_paper()
     known = read_distances(distances) if distances else printed_distances(paper)
-    strips = study_strips(scores, data, rollouts) if data and rollouts else {}
+    videos = find_videos(rollouts) if data and rollouts else {}
+    strips = study_strips(scores, data, videos) if data else {}
     axes, spreads = ({axis: known.of(axis, column) for axis in AXES} for column in ("value", "spread"))
     grades = StudyGrades(scores.rows, scores.metrics, axes, known.measured, spreads, codecs=scores.codecs)
     printed = PaperGrades(paper, scores.metrics)
@@ -172,8 +176,11 @@ def build(
     of_paper = any(builder.has_results(part) for part in PAPER_PARTS)
     findings, by_paper, by_print = (ask(g) if of_paper else [] for g in (StrictGrades(grades), grades, printed))
     missing = find_missing_scores(scores.rows)
+    contests = list(study_contests(grades))
+    shown = median_episodes({robot: variant for robot, variant, _ in contests}, scores.rows, data, videos) if data else {}
     content = Content(
         TITLE,
+        answer([contest for *_, contest in contests], answer_strip(shown, scores.frame_zero)),
         study_sentences(grades, known, (difficulty.get("lpips"), gaps.get("lpips")), motions, findings, by_paper),
         {HERE: findings, BY_PAPER: by_paper, PRINTED: by_print} if of_paper else {},
         CLAIMS_TEXT,
@@ -215,7 +222,7 @@ def _write_html(content: Content, endings: Mapping[str, Markup], footer: str) ->
     sections |= {PART_TITLES[part]: text for part in SECTIONS if (text := _part_section(content, part))}
     sections |= endings
     head = [page.contents(list(sections)), *map(page.note, content.notes)]
-    return page.page(content.title, content.sentences, [*head, *sections.values()], footer)
+    return page.page(content.title, content.sentences, [*head, *sections.values()], footer, content.first)
 
 
 def _claims_section(content: Content) -> Markup:
@@ -232,9 +239,7 @@ def _part_section(content: Content, part: str) -> Markup | None:
     parts = [page.chart(content.charts[name]) for name in charts if name in content.charts]
     parts += [page.table(content.tables[name]) for name in shown if name in content.tables]
     if part in content.strips:
-        strip = content.strips[part]
-        source = pictures.data_uri(strip.image)
-        parts.append(page.labeled_picture(source, strip.caption, strip.columns, strip.rows))
+        parts.append(page.strip(content.strips[part]))
     if FRAME_CHARTS.get(part) in content.charts:
         parts.append(page.chart(content.charts[FRAME_CHARTS[part]]))
     hidden = [content.tables[name] for name in folded if name in content.tables]
@@ -266,6 +271,8 @@ def _write_markdown(content: Content) -> str:
     lines = [
         f"# {content.title}",
         "",
+        *([content.first.sentence, ""] if content.first else []),
+        *([f"![{content.first.chart.caption}](figures/answer.png)", ""] if content.first and content.first.chart else []),
         *(f"- {plain_markdown(sentence)}" for sentence in content.sentences),
         "",
         *(f"> {note}\n" for note in content.notes),
@@ -296,7 +303,8 @@ def _files(content: Content) -> Iterator[tuple[str, bytes]]:
     for name, table in content.tables.items():
         yield f"tables/{name}.tex", formats.latex(table).encode()
         yield f"tables/{name}.csv", csv_text(formats.table_frame(table)).encode()
-    for chart in content.charts.values():
+    first = [content.first.chart] if content.first and content.first.chart else []
+    for chart in (*first, *content.charts.values()):
         for name, data in chart_files(chart).items():
             yield f"figures/{name}", data
     for part, strip in content.strips.items():

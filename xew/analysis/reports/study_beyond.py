@@ -13,9 +13,9 @@ from xew.analysis.reports import charts
 from xew.analysis.reports.charts import SERIES, SOFT, Chart, Panel, Series
 from xew.analysis.statistics.grades import SEEN
 from xew.analysis.tables.builder import Builder
-from xew.analysis.tables.distances import AXIS_TITLES, format_signed
+from xew.analysis.tables.distances import AXIS_TITLES
 from xew.analysis.tables.labels import ACTIONS, GROUP_TITLES, HELD_OUT_TITLES
-from xew.analysis.tables.table import metric_title
+from xew.analysis.tables.table import format_signed, metric_title
 from xew.protocol import MOTIONS
 
 METRIC = "lpips"

@@ -14,7 +14,7 @@ from xew.analysis.correlation import Correlation, dof_correlation, loeo_correlat
 from xew.analysis.paper import AXES, PAPER_TITLES, Paper
 from xew.analysis.statistics.grades import Grades, unseen_gap
 from xew.analysis.tables.labels import PAPER_METRICS, ROBOT_TITLES, SHORT_ROBOTS
-from xew.analysis.tables.table import Column, Table, TableCell, TableRow, TableSection, metric_title
+from xew.analysis.tables.table import Column, Table, TableCell, TableRow, TableSection, format_signed, metric_title
 from xew.config import ConfigError
 from xew.protocol import HELD_OUT_ROBOTS, ROBOT_NAMES
 from xew.statistics import Mean, strict_metrics
@@ -267,11 +267,6 @@ def certainty_table(grades: Grades, distances: Distances, paper: Paper) -> Table
         tuple(Column(head, AXIS_TITLES[axis]) for axis in AXES for head in heads),
         (TableSection("", tuple(row(metric) for metric in shown), _note_missing_folds(grades, shown)),),
     )
-
-
-def format_signed(value: float) -> str:
-    """Text such as '+0.812'."""
-    return f"{value:+z.3f}".replace("-", "−")
 
 
 def _loeo_scores(grades: Grades, metric: str) -> list[float] | None:

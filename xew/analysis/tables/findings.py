@@ -16,6 +16,7 @@ import pandas as pd
 from xew.analysis.statistics.grades import Grades
 from xew.analysis.tables.claims import CLAIMS
 from xew.analysis.tables.comparisons import Claim, Comparison, NotMeasuredError, Reader
+from xew.analysis.tables.table import format_plain, format_share
 from xew.statistics import SIGNIFICANCE, holm
 
 HOLDS, FAILS, UNRESOLVED, UNMEASURED = "holds", "fails", "unresolved", "not measured"
@@ -81,9 +82,9 @@ class Finding:
 
     @property
     def basis(self) -> str:
-        """Text that says whose result it is: 'of this training', or of how many; '' for the paper."""
+        """Text such as '2 training runs', which the result rests on; '' for the paper."""
         least = min((one.trainings for one in self.comparisons if one.trainings), default=0)
-        return "" if not least else "of this training" if least == 1 else f"of {least} trainings"
+        return "" if not least else "one training run" if least == 1 else f"{least} training runs"
 
     def span(self) -> str:
         """Text with the smallest and the largest number."""
@@ -148,21 +149,12 @@ def _answer_comparison(comparison: Comparison, p_holds: float, p_fails: float, l
     value, (low, high) = number.value, number.interval(level)
     if comparison.doubt:
         p_holds = p_fails = 1.0
-    show = _format_share if comparison.percent else _format_plain
+    show = format_share if comparison.percent else format_plain
     ends = "" if low == high or np.isnan(low) else f" [{show(low)}, {show(high)}]"
     numbers, answer = f"{show(value)}{ends}{doubt}", _answer(p_holds, p_fails)
     return AnsweredComparison(
         comparison.label, numbers, value, low, high, answer, float(p_holds), float(p_fails), number.trainings
     )
-
-
-def _format_share(value: float) -> str:
-    digits = 1 if abs(value) < 0.0995 else 0
-    return f"{100 * value:z.{digits}f}\u00a0%".replace("-", "−")
-
-
-def _format_plain(value: float) -> str:
-    return f"{value:z.3f}".replace("-", "−")
 
 
 def findings_frame(findings: Sequence[Finding], of: str) -> pd.DataFrame:

@@ -215,4 +215,4 @@ def _findings_caption(findings: Sequence[Finding]) -> str:
     """Text that says what corrections are made, and whose results these are."""
     bases = ", ".join(dict.fromkeys(finding.basis for finding in findings if finding.basis))
     text = "p-values are corrected by Holm's method for the comparisons of a claim, and once more for all claims."
-    return f"{text} Results are {bases}." if bases else text
+    return f"{text} Results rest on {bases}." if bases else text

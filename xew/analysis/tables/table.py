@@ -98,8 +98,29 @@ def parting_note(sections: Sequence[TableSection]) -> str:
 
 
 def format_number(value: float, metric: MetricInfo) -> str:
-    """A value with the digits that mean something: 0.01 dB, 0.1 px, else 0.001."""
+    """A value with its significant digits: 0.01 dB, 0.1 px, else 0.001."""
     return f"{value:.{ {'dB': 2, 'px': 1}.get(metric.unit, 3) }f}"
+
+
+def format_plain(value: float) -> str:
+    """Text such as '−0.812'."""
+    return f"{value:z.3f}".replace("-", "−")
+
+
+def format_signed(value: float) -> str:
+    """Text such as '+0.812'."""
+    return f"{value:+z.3f}".replace("-", "−")
+
+
+def format_share(value: float) -> str:
+    """Text such as '8.5 %' or '31 %'."""
+    digits = 1 if abs(value) < 0.0995 else 0
+    return f"{100 * value:z.{digits}f}\u00a0%".replace("-", "−")
+
+
+def format_change(share: float) -> str:
+    """Text such as '+31 %'."""
+    return f"{100 * share:+z.0f}\u00a0%".replace("-", "−")
 
 
 def metric_title(metric: MetricInfo) -> str:
@@ -115,9 +136,9 @@ def metric_columns(metrics: Mapping[str, MetricInfo], names: Sequence[str]) -> t
 
 
 def format_interval(ends: tuple[float, float], metric: MetricInfo) -> str:
-    """Text such as '0.12–0.15'; '' where there is no interval, or none at these digits."""
-    low, high = ends
-    if np.isnan(low):
+    """Text such as '0.12–0.15', inside the metric's range; '' where there is no interval, or none at these digits."""
+    if np.isnan(ends[0]):
         return ""
-    first, last = format_number(low, metric), format_number(high, metric)
+    low, high = (-np.inf if metric.low is None else metric.low), (np.inf if metric.high is None else metric.high)
+    first, last = (format_number(float(np.clip(end, low, high)), metric) for end in ends)
     return "" if first == last else f"{first}–{last}"
