@@ -229,5 +229,5 @@ def test_robots_that_are_pooled_are_the_same_in_a_run_and_a_study(tmp_path: Path
     for row in table.rows:
         for metric, score in row.scores.items():
             name = " ".join(filter(None, (row.model, row.condition)))
-            mean = grades.baseline(name, SEEN_ROBOTS, metric)
+            mean = grades.variant_mean(name, SEEN_ROBOTS, metric)
             assert mean and (mean.value, *mean.interval(), mean.count) == (score.mean, score.low, score.high, score.count)

@@ -62,14 +62,13 @@ from xew.statistics import MIN_SCENES, find_parting, strict_metrics
 
 TITLE = "Can the model render a robot that it has never seen?"
 STRIP_METRIC = "lpips"
-"""Metric that ranks episodes, so that strips show the best, the median and the worst."""
+"""Metric that ranks episodes, so strips show the best, the median and the worst."""
 FRAME_ZERO = {
     "given": "frame 0 is given to the model and never scored",
     "absent": "frame 0, which the model was given and its videos leave out, is never scored",
     "predicted": "frame 0 is predicted too, and scored as all others",
 }
 CURVE_METRICS = ("lpips", "psnr", "mask_iou")
-"""Metrics whose error is drawn by frame."""
 FILES = ("index.html", "report.md", "*.csv", "figures/*", "tables/*")
 """Patterns of the paths of what is written into the folder of a report."""
 NO_FILE_NAME = re.compile(r"[<>\"/\\|?*()\[\]`']+")
@@ -84,7 +83,7 @@ EXPLORER = "explorer/index.html"
 
 @dataclass(frozen=True)
 class Args:
-    """Turn a score table into one HTML page, with Markdown and CSV beside it."""
+    """Turn a score table into one HTML page, with Markdown and CSV next to it."""
 
     scores: Annotated[Path | None, tyro.conf.Positional] = None
     """Score table that python -m xew.metrics.evaluate made; needed unless --paper is given."""
@@ -95,11 +94,11 @@ class Args:
     out: Path = Path("report")
     """Folder to write."""
     held_out: tuple[str, ...] = HELD_OUT_ROBOTS
-    """Robots that the models have not seen; each has a table of its own, as have all robots that are not the paper's."""
+    """Robots that the models have not seen; each has its own table, and so has every custom robot."""
     distances: Path | None = None
     """Folder that python -m xew.analysis.distance wrote, for a study; without it the paper's distances are used."""
     other_motion: Path | None = None
-    """Score table of the same study in the other kind of motion: action representations of both stand side by side."""
+    """Score table of the same study in the other kind of motion, to compare action representations."""
     explorer: bool = False
     """Write <out>/explorer too, a page that plays the scenes of the strips, for the report of one run."""
     paper: bool = False
@@ -112,7 +111,6 @@ class Picture:
 
     name: str
     image: bytes
-    """PNG file."""
     html: Markup
 
 
@@ -132,7 +130,6 @@ def main(args: Args) -> None:
 
 
 def _check_motion(args: Args, scores: Scores) -> None:
-    """Raise ConfigError or EpisodeError where the data are of another kind of motion than the scores, or of both."""
     records = [record for _, record in find_records(args.data)] if args.data else []
     motion = demand_one_motion(args.data, records) if args.data and records else scores.motion
     if motion != scores.motion:
@@ -242,11 +239,10 @@ def _held_out_section(tables: Sequence[RobotTable], metrics: Sequence[MetricInfo
     return page.section(
         "Robots never seen in training",
         page.paragraph(
-            "Means over episodes with 95 % bootstrap intervals; scenes (task and seed) are resampled. Against the frozen first "
-            "frame, paired by episode: ▲ better, ▼ worse, ≈ not resolved. The suite strict decides: where one of its metrics "
-            "stands beside the paper's, that has the mark, and the paper's has one in parentheses where its verdict is "
-            "another. The ceiling is the true video graded in the model's "
-            "place: what it lacks is the estimators' own error, and a smaller difference is not resolved."
+            "Means over episodes with 95 % bootstrap intervals; scenes (task and seed) are resampled. Compared with the frozen "
+            "first frame, paired by episode: ▲ better, ▼ worse, ≈ not resolved. Strict metrics decide; the paper's metric has "
+            "a mark in parentheses where its verdict differs. The true video's scores show the estimators' error, and smaller "
+            "differences are not resolved."
         ),
         *map(page.note, _caution_notes(tables)),
         *(page.table(run_table(table, metrics)) for table in tables),
@@ -254,7 +250,6 @@ def _held_out_section(tables: Sequence[RobotTable], metrics: Sequence[MetricInfo
 
 
 def _caution_notes(tables: Sequence[RobotTable]) -> list[str]:
-    """A note where episodes are few; none where there are enough."""
     few = min((table.count for table in tables), default=np.inf)
     if few < MIN_SCENES:
         return [f"Fewer than {MIN_SCENES} scenes: no intervals, and nothing is resolved."]
@@ -264,7 +259,7 @@ def _caution_notes(tables: Sequence[RobotTable]) -> list[str]:
 def _seen_section(tables: Sequence[RobotTable], metrics: Sequence[MetricInfo]) -> Markup | None:
     if not tables:
         return None
-    text = "The same model on robots that it was trained on, at test seeds: what is missing here is not embodiment."
+    text = "The same model on its training robots, at test seeds."
     return page.section("Robots seen in training", page.paragraph(text), *(page.table(run_table(t, metrics)) for t in tables))
 
 
@@ -287,18 +282,17 @@ def run_table(table: RobotTable, metrics: Sequence[MetricInfo]) -> Table:
 
 
 def _run_row(row: Row, shown: Sequence[MetricInfo], metrics: Mapping[str, MetricInfo]) -> TableRow:
-    """A model's means with their marks; a metric beside one of the suite strict has a mark only where the two part."""
+    """A model's means with their marks; a metric with a strict counterpart has a mark only where their verdicts differ."""
     strict, parting = strict_metrics(metrics), {paper for _, paper in find_parting(row.verdicts, metrics)}
     cells = []
     for metric in shown:
         word = row.verdicts.get(metric.name, "")
-        own, beside = ("" if metric.name in strict else word), (word if metric.name in parting else "")
-        cells.append(_run_cell(row, metric, own, beside))
+        own, differing = ("" if metric.name in strict else word), (word if metric.name in parting else "")
+        cells.append(_run_cell(row, metric, own, differing))
     return TableRow((row.title,), tuple(cells), row.model in BASELINES)
 
 
 def _run_cell(row: Row, metric: MetricInfo, verdict: str, parting: str) -> TableCell:
-    """A mean with the marks of a `TableCell`."""
     score = row.scores.get(metric.name)
     if score is None:
         return TableCell()
@@ -321,13 +315,13 @@ def _strip_section(strips: Sequence[Picture], args: Args) -> Markup:
         missing = "name the data and the rollouts (--data, --rollouts)"
         if args.data and args.rollouts:
             missing = f"no held-out robot has a score of {STRIP_METRIC}, by which episodes are chosen; grade it too (--metrics)"
-        return page.section("What it looks like", page.note(f"No pictures: {missing}."))
+        return page.section("Best, median and worst episodes", page.note(f"No pictures: {missing}."))
     text = (
-        "Best, median and worst episode of each held-out robot by LPIPS. The difference is the largest of the three "
-        f"channels, white for none, black for {pictures.DIFFERENCE_FULL} of 255 levels or more."
+        "Episodes of each held-out robot, ranked by LPIPS. The difference is the largest of the three "
+        f"channels: white for none, black for {pictures.DIFFERENCE_FULL} of 255 levels or more."
     )
     played = [page.link("All robots' videos of these scenes side by side, as they run", EXPLORER)] if args.explorer else []
-    return page.section("What it looks like", page.paragraph(text), *played, *(strip.html for strip in strips))
+    return page.section("Best, median and worst episodes", page.paragraph(text), *played, *(strip.html for strip in strips))
 
 
 def _method_section(scores: Scores, args: Args) -> Markup:
@@ -343,7 +337,6 @@ def _method_section(scores: Scores, args: Args) -> Markup:
 
 
 def _choose_episodes(scores: Scores, held_out: Sequence[str]) -> list[tuple[str, pd.Series]]:
-    """Up to three episodes of each held-out robot and model, each with what it is of them."""
     rows = scores.rows[(scores.rows["metric"] == STRIP_METRIC) & scores.rows["robot"].isin(held_out)]
     rows = rows[~rows["model"].isin(BASELINES)]
     return [pair for _, group in rows.groupby(["robot", "model", "condition"]) for pair in _rank_episodes(group)]
@@ -365,7 +358,6 @@ def _write_explorer(scores: Scores, args: Args) -> None:
 
 
 def _make_answer_strip(scores: Scores, args: Args, tables: Sequence[RobotTable], rollouts: Rollouts) -> Strip | None:
-    """Make the first screen's picture, of the best model's median episode on each held-out robot."""
     episodes: dict[str, tuple[Path, Rollout]] = {}
     for word, row in _choose_episodes(scores, args.held_out) if args.data else ():
         title = robot_title(row["robot"])
@@ -377,7 +369,6 @@ def _make_answer_strip(scores: Scores, args: Args, tables: Sequence[RobotTable],
 
 
 def _make_strips(scores: Scores, args: Args, rollouts: Rollouts) -> list[Picture]:
-    """Make the strips of the chosen episodes."""
     assert args.data is not None
     shown = tqdm(_choose_episodes(scores, args.held_out), desc="strips", unit="strip", disable=None)
     return [_make_strip(row, word, rollouts, args.data, scores.frame_zero) for word, row in shown]
@@ -433,9 +424,8 @@ def _write_markdown(
     figures: Sequence[Picture],
     charts: Mapping[str, bytes],
 ) -> tuple[str, dict[str, bytes]]:
-    """The text of report.md, and the files beside it."""
-    told = [f"- {plain_markdown(sentence)}" for sentence in sentences]
-    lines = [f"# {TITLE}", "", *told, *(f"\n> {plain_markdown(note)}" for note in notes)]
+    bullets = [f"- {plain_markdown(sentence)}" for sentence in sentences]
+    lines = [f"# {TITLE}", "", *bullets, *(f"\n> {plain_markdown(note)}" for note in notes)]
     made: list[Table] = []
     for heading, tables in (("Robots never seen in training", held_out), ("Robots seen in training", seen)):
         shown = [run_table(table, scores.metrics) for table in tables]
@@ -450,7 +440,7 @@ def _write_markdown(
 
 
 def _write_report(out: Path, html: str, markdown: tuple[str, Mapping[str, bytes]], summary: pd.DataFrame) -> None:
-    """Write all files, the page last, so that everything it speaks of exists once it does."""
+    """Write all files, the page last, so it refers to existing files."""
     text, files = markdown
     try:
         for name, content in files.items():

@@ -1,7 +1,6 @@
-"""The first screen of a report: the answer to its title in one sentence, with one picture and one chart.
+"""The first screen of a report: the answer to its title in one sentence, one picture and one chart.
 
-The best model on each held-out robot, by LPIPS, is compared with the paste baseline, or with the frozen first frame where
-pasting was not graded.
+The best model on each held-out robot, by LPIPS, is compared with the paste baseline, or else with the frozen first frame.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -29,7 +28,6 @@ from xew.rollout import Rollout, read_rollout_video
 from xew.statistics import BETTER, UNRESOLVED, WORSE, combine, verdict
 
 METRIC = "lpips"
-"""Metric that answers, the paper's primary outcome."""
 BEST = "best model"
 TITLES = {PASTED_RENDER: "paste baseline", COPY: "frozen first frame"}
 """Names of the baselines that a model is compared with, the preferred one first."""
@@ -40,11 +38,8 @@ class Contest:
     """The best model on one held-out robot, compared with a baseline."""
 
     robot: str
-    """Title of the robot."""
     baseline: str
-    """Key of TITLES."""
     verdict: str
-    """Verdict on the model: better, worse or unresolved."""
     bars: Mapping[str, tuple[float, float, float]]
     """Mean and ends of the interval, by the label of the model or baseline; the model first."""
 
@@ -132,12 +127,7 @@ def study_contests(grades: StudyGrades) -> Iterator[tuple[str, str, Contest]]:
 
 
 def answer_strip(episodes: Mapping[str, tuple[Path, Rollout]], frame_zero: str) -> Strip | None:
-    """Truth, prediction and pasted render, a row for each robot's title; None without an episode.
-
-    Args:
-        episodes: folder of the episode and its rollout, by the robot's title.
-        frame_zero: treatment of frame 0 in the score table.
-    """
+    """Truth, prediction and pasted render of the episode and rollout of each robot's title; None without an episode."""
     frames = []
     for folder, rollout in episodes.values():
         truth = read_video(folder / "rgb.mkv")

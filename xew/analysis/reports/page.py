@@ -1,7 +1,4 @@
-"""The report's HTML, from the templates beside this file. Text in, markup out; `report` reads and writes files.
-
-Every value is escaped by the templates, except markup that these functions have made.
-"""
+"""The report's HTML, from the templates next to this file, which escape every value except markup from these functions."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -19,7 +16,7 @@ from xew.analysis.tables.findings import Finding
 from xew.analysis.tables.table import Column, Table, TableRow
 
 MOST_COLUMNS = 10
-"""Largest number of columns of values that stand beside one another on a page of 1400 pixels, unless one group has more."""
+"""Largest number of columns of values side by side on a page of 1400 pixels, unless one group has more."""
 TEMPLATES = Environment(
     loader=PackageLoader("xew.analysis.reports"),
     autoescape=True,
@@ -65,7 +62,7 @@ def paragraph(text: str) -> Markup:
 
 
 def link(text: str, target: str) -> Markup:
-    """A paragraph that leads to a file beside the page."""
+    """A paragraph that leads to a file next to the page."""
     return _render("text.html", "link", text, target)
 
 
@@ -87,7 +84,7 @@ def table(table: Table) -> Markup:
 
 @dataclass(frozen=True)
 class _Band:
-    """Columns of a table that stand beside one another."""
+    """Columns of a table that are side by side."""
 
     first: int
     columns: tuple[Column, ...]
@@ -121,7 +118,6 @@ class _Label:
 
     text: str
     leads: bool
-    """Whether it stands in the first column."""
     rows: int = 0
     """Number of rows that it stands for; 0 for a label that belongs to its row alone."""
 
@@ -138,7 +134,7 @@ def _labels(rows: Sequence[TableRow], index: int) -> Iterator[_Label]:
 
 
 def chart(chart: Chart) -> Markup:
-    """A chart with its legend; panels stand beside or below one another, as there is room."""
+    """A chart with its legend; panels are side by side or stacked."""
     panels = [Markup(panel_svg(chart, panel)) for panel in chart.panels]
     kinds = {"-": "line", "--": "dashed", "-.": "dashdot", ":": "dotted", "o": "ring"}
     legend = [{"label": one.label, "kind": kinds[one.dash], "color": themed_color(one.color)} for one in chart.legend]
@@ -146,15 +142,7 @@ def chart(chart: Chart) -> Markup:
 
 
 def labeled_picture(source: str, caption: str, columns: Sequence[str], rows: Sequence[str], title: str = "") -> Markup:
-    """A sheet of pictures with the names of its columns above and of its rows at the left.
-
-    Args:
-        source: data URI of the picture.
-        caption: text after the title, which stands in bold.
-        columns: names of the columns.
-        rows: names of the rows.
-        title: beginning of the caption, if any.
-    """
+    """A data URI's picture with labels of its columns above and of its rows at the left; the title is bold."""
     return _render("figures.html", "labeled_picture", source, title, caption, columns, rows)
 
 

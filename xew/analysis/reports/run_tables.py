@@ -40,7 +40,6 @@ class Row:
     model: str
     condition: str
     scores: dict[str, Interval]
-    """Mean and interval of each metric."""
     verdicts: dict[str, str]
     """Verdict on each metric against the frozen first frame, paired by episode; empty for baselines."""
     over_pasting: dict[str, str] = field(default_factory=dict)
@@ -97,7 +96,6 @@ def robot_table(scores: Scores, title: str, robots: Sequence[str], expected: int
 
 
 def _row(key: tuple[str, str], summary: Summary, metrics: Sequence[str], baselines: Sequence[str]) -> Row:
-    """A row of a table; a model has verdicts against each of these baselines."""
     means, pairs = (t[(t["model"] == key[0]) & (t["condition"] == key[1])] for t in (summary.means, summary.pairs))
     scores = {
         row["metric"]: Interval(row["mean"], row["low"], row["high"], row["episodes"]) for row in means.to_dict("records")

@@ -1,8 +1,4 @@
-"""The report of a study, from a score table with the column `variant`; `report` reads and writes files.
-
-What came out stands first, then the claims with their answers, then a section for each question of the paper: chart, the
-main table, what it looks like, and all metrics folded away.
-"""
+"""The report of a study, from a score table with the column `variant`: results, claims, and a section for each question."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -53,14 +49,14 @@ from xew.protocol import PAPER_PARTS
 TITLE = "Can the model render a robot that it has never seen?"
 PART_TITLES = {
     "fixed": "Seen and unseen robots",
-    "actions": "How it is told to move",
-    "ladder": "What it is told of the robot's looks",
-    "few_shot": "Adaptation, and what it costs",
+    "actions": "Action representation",
+    "ladder": "Conditioning on the robot's appearance",
+    "few_shot": "Few-shot adaptation and forgetting",
     "loeo": "Does distance predict difficulty?",
     "baselines": "Other world models",
     "scaling": "More bodies in training",
     "bodies": "Distance and difficulty over many bodies",
-    "halves": "Distance and the price of never having seen a body",
+    "halves": "Distance and the gap of unseen bodies",
     "motion": "Shared and own motion",
     "outside": "Outside the protocol",
 }
@@ -86,14 +82,12 @@ METHOD = "How it was measured"
 HERE, BY_PAPER, PRINTED = "here", "here, paper's definitions", "paper"
 """Sources of answers to claims: the scores by the suite strict, the scores by the paper's definitions, the paper's figures."""
 CLAIMS_TEXT = (
-    "Each claim of the paper as inequalities, asked of this study and of the paper's own printed figures. It holds where "
-    "every number lies on its side of the bound, and fails where one lies on the other side, each at 5 % after Holm's "
-    "correction for the comparisons of the claim (for the paper: with all that prints the same); anything else is "
-    "unresolved. “Among all claims” corrects once more, for all of them. That something saturates or is alike is an "
-    "equivalence: two one-sided tests with the margins that the claim names. Metrics of the suite strict decide, in which "
-    "what is lost is an error; where the paper's definitions give another answer, it stands beside. Claims about what a "
-    "model is told also say whether these models beat the first frame with the robot's render pasted in. The last ones, "
-    "“ours”, ask more than the paper claims."
+    "Each claim of the paper is tested as inequalities, on this study and on the paper's printed figures. A claim holds if "
+    "all numbers lie on its side of the bound, and fails if one lies on the other side, at 5 % after Holm's correction within "
+    "the claim. Otherwise it is unresolved. “Among all claims” corrects for all claims. Claims of equality are equivalences: "
+    "two one-sided tests with the margins in the claim. Strict metrics decide; answers by the paper's definitions are shown "
+    "where they differ. Claims about conditioning also say whether the models beat the paste baseline. Claims marked “ours” "
+    "are stricter than the paper's."
 )
 FRAME_CHARTS = {"actions": "frames_actions", "ladder": "frames_ladder"}
 
@@ -106,7 +100,6 @@ class Report:
     markdown: str
     summary: pd.DataFrame
     files: Mapping[str, bytes]
-    """Further files by path relative to the folder."""
 
 
 @dataclass(frozen=True)
@@ -115,21 +108,16 @@ class Content:
 
     title: str
     first: Answer | None
-    """First screen of the page; None leaves it out."""
     sentences: Sequence[str]
     findings: Mapping[str, Sequence[Finding]]
     """Answers to the claims by what they were asked of: HERE, BY_PAPER and PRINTED; the first decides. Empty where none was."""
     claims_text: str
-    """Paragraph that explains the answers."""
     tables: Mapping[str, Table]
     charts: Mapping[str, Chart]
     strips: Mapping[str, Strip] = field(default_factory=dict)
     notes: Sequence[str] = ()
-    """Notes on what is missing."""
     missing: pd.DataFrame = field(default_factory=pd.DataFrame)
-    """Scores that other models have."""
     trainings: str = ""
-    """Sentence that says whether intervals are of one training or of several."""
 
     @property
     def deciding(self) -> Sequence[Finding]:
@@ -149,14 +137,13 @@ def build(
 
     Args:
         scores: with the column `variant`.
-        data: the data set, for pictures.
-        rollouts: trees of rollouts named after their variants, or folders that hold such trees; for pictures.
-        distances: folder of the command of distances; the paper's printed ones where None.
-        footer: text of the footer, versions.
-        other_motion: scores of the same study in the other kind of motion, if there are any.
+        data, rollouts: for pictures; trees of rollouts are named after their variants, or are folders of such trees.
+        distances: folder of the distance command; None for the paper's printed distances.
+        footer: text of the footer.
+        other_motion: scores of the same study in the other kind of motion.
 
     Raises:
-        ConfigError: a file that was named cannot be read, or both studies are of one kind of motion.
+        ConfigError: a named file cannot be read, or both studies are of one kind of motion.
     """
     paper = read_paper()
     known = read_distances(distances) if distances else printed_distances(paper)
@@ -217,7 +204,6 @@ def _make_tables(builder: Builder, scores: Scores, known: Distances, notes: Sequ
 
 
 def _write_html(content: Content, endings: Mapping[str, Markup], footer: str) -> str:
-    """The page."""
     sections = {"Claims": _claims_section(content)} if content.findings else {}
     sections |= {PART_TITLES[part]: text for part in SECTIONS if (text := _part_section(content, part))}
     sections |= endings
@@ -255,11 +241,9 @@ def _method_section(content: Content, scores: Scores) -> Markup:
         METHOD,
         page.paragraph(
             f"Means over episodes with 95 % bootstrap intervals. {content.trainings} Scenes (seeds) are resampled within their "
-            "tasks, the same ones for every model and robot, so that all comparisons are paired. Behind a value, against the "
-            "row that the caption names: "
-            f"{MARKS}. “True video, graded” is the truth in the model's place: what it lacks is the estimators' own error, "
-            "the noise floor. The paper's values are of its own renders and a model of five billion weights; they stand "
-            "beside ours where its protocol is the same."
+            "tasks, the same for every model and robot, so all comparisons are paired. Marks compare a value with the row in "
+            f"the caption: {MARKS}. “True video, graded” has the estimators' error, the noise floor. The paper's values come "
+            "from its own renders and a model of five billion weights; they are shown where its protocol is the same."
         ),
         page.table(content.tables["counts"]),
         page.definitions(definitions),

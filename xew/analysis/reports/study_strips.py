@@ -19,7 +19,6 @@ from xew.rollout import Rollout, find_rollouts, read_rollout_video
 RANKED_BY = "lpips"
 """Metric by which the median scene is found."""
 Videos = dict[tuple[str, str, int, str], Rollout]
-"""Rollouts by variant, task, seed and robot."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +26,6 @@ class Strip:
     """A sheet of frames with its labels."""
 
     image: bytes
-    """PNG file."""
     caption: str
     columns: Sequence[str]
     rows: Sequence[str]

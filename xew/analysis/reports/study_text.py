@@ -89,12 +89,9 @@ def find_parting_claims(findings: Sequence[Finding], by_paper: Sequence[Finding]
 
 
 def parting_sentence(findings: Sequence[Finding], by_paper: Sequence[Finding], graded: bool) -> Iterator[str]:
-    """Sentence on the claims that the two suites answer differently; none where no claim could be tested.
+    """Sentence on the claims that strict metrics and the paper's definitions answer differently.
 
-    Args:
-        findings: by the suite strict.
-        by_paper: by the paper's definitions.
-        graded: whether any strict metric was graded that replaces one of the paper's.
+    None where no claim could be tested; `graded` says whether any strict metric replaces one of the paper's.
     """
     if all(finding.answer == UNMEASURED for finding in findings):
         return
@@ -140,7 +137,6 @@ def _gap_sentences(grades: Grades) -> Iterator[str]:
 
 
 def _best_sentences(grades: Grades) -> Iterator[str]:
-    """Sentences on which action representation and which appearance condition help most."""
     for part, base, labels in (("actions", "joints", ACTIONS), ("ladder", "none", LADDER)):
         parts = []
         for robot in HELD_OUT_ROBOTS:
@@ -179,7 +175,6 @@ def _distance_sentences(grades: Grades, distances: Distances) -> Iterator[str]:
 
 
 def _scaling_sentence(grades: Grades) -> Iterator[str]:
-    """The effect of the largest number of bodies in training, on each held-out robot and on unseen bodies."""
     rows = [f"scaling_seen_bodies_{count}" for count in BODY_SCALES]
     known = [row for row in rows if _gain(grades, "scaling", row, "scaling_seen", BODIES) is not None]
     if known:
@@ -191,7 +186,6 @@ def _scaling_sentence(grades: Grades) -> Iterator[str]:
 
 
 def _bodies_sentence(difficulty: OverBodies | None) -> Iterator[str]:
-    """Correlation of LPIPS on bodies of the wide family with each of the paper's distances, and with the frozen frame's."""
     parts = _correlations(difficulty) if difficulty else []
     if difficulty and parts:
         errors = difficulty.values
@@ -203,7 +197,6 @@ def _bodies_sentence(difficulty: OverBodies | None) -> Iterator[str]:
 
 
 def _halves_sentence(gaps: OverBodies | None) -> Iterator[str]:
-    """Correlation with the paper's distances of the gap in LPIPS between a model that saw a body and one that did not."""
     parts = _correlations(gaps) if gaps else []
     if gaps and parts:
         shares = gaps.values["value"] / 100
@@ -215,7 +208,6 @@ def _halves_sentence(gaps: OverBodies | None) -> Iterator[str]:
 
 
 def _motion_sentences(motions: Motions | None) -> Iterator[str]:
-    """Difference of each action representation's LPIPS between own and shared motion, on each held-out robot."""
     if motions is None:
         return
     for robot in HELD_OUT_ROBOTS:
@@ -230,7 +222,6 @@ def _motion_sentences(motions: Motions | None) -> Iterator[str]:
 
 
 def _correlations(difficulty: OverBodies) -> list[str]:
-    """Correlations over bodies with each of the paper's distances, in words."""
     return [
         f"with {axis} distance at r = {format_signed(result.r)} ({format_signed(result.low)} to {format_signed(result.high)}, "
         f"p = {result.p_value:.3f})"

@@ -19,7 +19,6 @@ from xew.statistics import Mean, combine
 
 FRANKA, PIPER = HELD_OUT_ROBOTS
 PIXELS = ("ray_map", "mask", "optical_flow")
-"""Image-space action representations."""
 Comparisons = Callable[[Reader], Iterator[Comparison]]
 
 
@@ -29,13 +28,9 @@ def _gap(reader: Reader) -> Iterator[Comparison]:
 
 
 def _gains(part: str, pairs: Sequence[tuple[str, str, str]], metrics: Sequence[str], above: float = 0) -> Comparisons:
-    """Gains of rows over others of the same part, on both held-out robots.
+    """Gains of rows over others of a part, on both held-out robots.
 
-    Args:
-        part: of the protocol.
-        pairs: row, the row before it, and the beginning of the label; `{robot}` stands for the robot's key.
-        metrics: keys of the metrics.
-        above: bound of each gain.
+    `pairs` are row, row before it, and beginning of the label; `{robot}` stands for the robot's key.
     """
 
     def compare(reader: Reader) -> Iterator[Comparison]:

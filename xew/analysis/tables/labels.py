@@ -11,15 +11,11 @@ from xew.protocol import HELD_OUT_ROBOTS, PARTS, SEEN_ROBOTS
 from xew.sim_warp.robots import ROBOTS
 
 PAPER_METRICS = tuple(PAPER_TITLES)
-"""Metrics of the paper's suite, in its order."""
 ROBOT_TITLES = {key: robot.title for key, robot in ROBOTS.items()}
-"""Title of each robot by its key."""
 SHORT_ROBOTS = {key: robot.label for key, robot in ROBOTS.items()}
-"""Label of each robot by its key."""
 SEEN_TITLE = "Seen robots, pooled: {}, {} and {}".format(*(ROBOT_TITLES[robot] for robot in SEEN_ROBOTS))
 """Title of means over the robots that the fixed split trains on."""
 HELD_OUT_TITLES = {robot: f"Held-out {ROBOTS[robot].title}" for robot in HELD_OUT_ROBOTS}
-"""Title of each robot that the fixed split holds out."""
 GROUP_TITLES = {SEEN: SEEN_TITLE, **HELD_OUT_TITLES}
 """Titles of the groups of robots in tables of the fixed split, by their names in addresses."""
 
@@ -45,20 +41,16 @@ def spell_key(key: str) -> str:
 
 
 ACTIONS = {variant.action: action_title(variant.action) for variant in PARTS["actions"]}
-"""Title of each action representation by its key."""
 LADDER = {variant.embodiment: condition_label(variant.embodiment) for variant in PARTS["ladder"]}
 """Label of each condition of the ladder by its key, from no condition to a render of every frame."""
 SYSTEMS = {
     variant.system: "reference model" if variant.system == REFERENCE else action_title(variant.action)
     for variant in PARTS["baselines"]
 }
-"""Title of each world model by its key."""
 SYSTEM_ACTIONS = tuple(
     REPRESENTATIONS[variant.action].label if variant.action in REPRESENTATIONS else spell_key(variant.action)
     for variant in PARTS["baselines"]
 )
-"""Labels of the actions that condition each of SYSTEMS."""
 TRUE = "true video, graded"
 """Label of the row of the true video."""
 REMEDIES = {"replay": "with replay", "lora": "with LoRA"}
-"""Label of each remedy against forgetting, by its key."""

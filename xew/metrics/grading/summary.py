@@ -13,25 +13,25 @@ from xew.statistics import (
     DRAWS,
     LEVEL,
     MIN_SCENES,
-    UNITS,
     Summary,
     describe_parting,
     describe_power,
     find_parting,
     summarize,
 )
+from xew.statistics.bootstrap import UNITS
 
 PAIRS_SHOWN = 6
 """Largest number of pairs of models in the Markdown summary; more are only in the file of pairs."""
 
 
 def summarize_robots(rows: pd.DataFrame, unit: str = "scene", robots_first: Sequence[str] = ()) -> Summary:
-    """Summarize a score table, each robot by itself.
+    """Summarize a score table robot by robot, `robots_first` before the others.
 
     Args:
         rows: model condition task seed robot metric value; attribute `codecs` as in `xew.statistics.floor_sources`.
-        unit: what is resampled, a key of UNITS.
-        robots_first: robots that come before the others.
+        unit: unit to resample, a key of UNITS.
+        robots_first: robots at the top.
     """
     names = {*rows.attrs.get("metrics", ()), *rows["metric"].unique()}
     robots = sorted(rows["robot"].unique(), key=lambda robot: (robot not in robots_first, robot))
