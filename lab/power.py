@@ -18,7 +18,8 @@ import tyro
 from xew.config import ConfigError, user_errors
 from xew.files import read_text, write_text
 from xew.metrics import METRICS
-from xew.statistics import LEAST_POWER, describe_power, measure_power
+from xew.statistics import describe_power, measure_power
+from xew.statistics.power import LEAST_POWER
 
 HEADING = "## What the metrics can tell"
 """Heading of the section on the page of the tasks."""

@@ -28,7 +28,7 @@ from xew.analysis.distances.workspaces import Frame
 from xew.analysis.paper import PAPER_TITLES, Paper, read_paper
 from xew.analysis.reports.paper import PRIMARY, describe_stability
 from xew.analysis.tables import formats
-from xew.analysis.tables.distances import format_signed
+from xew.analysis.tables.table import format_signed
 from xew.config import user_errors
 from xew.files import write_text
 

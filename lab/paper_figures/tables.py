@@ -10,9 +10,8 @@ from xew.analysis.correlation import Correlation, loeo_correlation
 from xew.analysis.distances.matrices import mean_distances
 from xew.analysis.distances.workspaces import Frame, chamfer_floor, measure
 from xew.analysis.paper import AXES, PAPER_TITLES, Paper, PublishedChange
-from xew.analysis.tables.distances import format_signed
 from xew.analysis.tables.labels import ACTIONS, LADDER, ROBOT_TITLES, SYSTEMS
-from xew.analysis.tables.table import Column, Table, TableCell, TableRow, TableSection
+from xew.analysis.tables.table import Column, Table, TableCell, TableRow, TableSection, format_signed
 from xew.protocol import ROBOT_NAMES
 from xew.sim_warp.robots import ROBOTS
 

@@ -187,9 +187,9 @@ def test_the_report_shows_both(scores: Path, tmp_path: Path) -> None:
     main(Args(scores, distances=tmp_path, out=tmp_path / "report"))
     text = (tmp_path / "report" / "report.md").read_text()
     assert "## More bodies in training" in text and "## Distance and difficulty over many bodies" in text
-    assert "Training on 16 bodies beside the three robots changes LPIPS by −3" in text
+    assert "Adding 16 bodies to the three training robots changes LPIPS by −3" in text
     assert "## Claims" not in text and "No part of the paper was run" in text, "what was not asked is not listed claim by claim"
-    assert "Over 64 bodies that one model has never seen, its LPIPS correlates with kinematic distance at r = +1.000 (" in text
+    assert "On 64 bodies that one model has never seen, its LPIPS correlates with kinematic distance at r = +1.000 (" in text
     for name in ("scaling", "bodies"):
         assert (tmp_path / "report" / "figures" / f"{name}.png").stat().st_size > 1000
     assert BODIES in set(pd.read_csv(tmp_path / "report" / "figures" / "scaling.csv")["robots"])
@@ -272,9 +272,9 @@ def test_the_report_shows_the_gap_of_bodies(halves: Path, tmp_path: Path) -> Non
     measured.robots.to_csv(tmp_path / "robots.csv", index=False)
     main(Args(halves, distances=tmp_path, out=tmp_path / "report"))
     text = (tmp_path / "report" / "report.md").read_text()
-    assert "## Distance and the price of never having seen a body" in text
+    assert "## Distance and the gap of unseen bodies" in text
     assert "The gap of 32 bodies against their distance" in text
-    assert "Over 32 bodies, a model that never saw the body has another LPIPS on it than one that did: +35" in text
+    assert "Over 32 bodies, LPIPS is 35\u00a0% higher on average for a model that never saw the body than for one" in text
     assert "This gap correlates with kinematic distance at r = +0.9" in text
     assert (tmp_path / "report" / "figures" / "halves.png").stat().st_size > 1000
 
@@ -336,9 +336,9 @@ def test_the_report_sets_both_motions_side_by_side(both_motions: tuple[Path, Pat
     main(Args(both_motions[0], other_motion=both_motions[1], out=tmp_path))
     text = (tmp_path / "report.md").read_text()
     assert "## Shared and own motion" in text and "one tool path" in text
-    for robot in ("Franka Panda", "Piper"):
+    for robot in ("Franka (Panda)", "Piper"):
         joints = "+100\u00a0% (+100\u00a0% to +100\u00a0%) with joint pose, +0\u00a0% (+0\u00a0% to +0\u00a0%) with ray map"
-        assert f"- Where each robot moves in its own way, LPIPS on {robot} differs by {joints}" in text
+        assert f"- From shared to own motion, LPIPS on {robot} changes by {joints}" in text
     assert "Shared and own motion" in (tmp_path / "index.html").read_text()
     drawn = pd.read_csv(tmp_path / "figures" / "motion.csv").set_index(["robots", "action", "motion"])
     joints, others = drawn["value"].xs("joints", level="action"), drawn["value"].drop("joints", level="action")

@@ -13,7 +13,7 @@ from lab.paper_figures.recompute import rebuild, recompute_changes, recompute_me
 from lab.paper_figures.tables import frame_distances, frame_results
 from xew.analysis.correlation import leave_one_out, loeo_correlation, pearson
 from xew.analysis.paper import AXES, read_paper
-from xew.analysis.tables.distances import format_signed
+from xew.analysis.tables.table import format_signed
 
 PAPER = read_paper()
 

@@ -121,16 +121,16 @@ def test_which_suite_decides_and_where_they_part_is_the_same_in_both(tmp_path: P
     assert set(summary.pairs.loc[~summary.pairs["decides"], "metric"]) == BESIDE
     flat = flat_summary(tables, scores.metrics)
     assert set(flat.loc[~flat["decides"], "metric"]) == BESIDE
-    text = "The suites part on {} (better) and {} (worse); strict decides."
+    text = "The suites disagree on {} (better) and {} (worse); strict decides."
     assert text.format("keypoint_error_strict", "keypoint_error") in to_markdown(replace(summary, pairs=two_models(summary)))
     sentences = finding(tables, [], scores.metrics)
     joints = [sentence for sentence in sentences if f": {JOINTS} " in sentence]
     assert len(joints) == len(ROBOTS)
     for sentence in joints:
         assert sentence.endswith(text.format("Strict keypoint error", "Keypoint error"))
-        decided = sentence[: sentence.index(" The suites part")]
+        decided = sentence[: sentence.index(" The suites disagree")]
         assert "Strict keypoint error" in decided and "Keypoint error" not in decided
-        assert "the pasted render" in decided
+        assert "the paste baseline" in decided
     # A mark stands at the metric that decides.
     (section,) = run_table(tables[0], scores.metrics).sections
     row = next(row for row in section.rows if row.labels == (JOINTS,))
@@ -168,10 +168,10 @@ def test_tasks_without_power_leave_the_means_of_the_suite_strict_in_both(tmp_pat
             assert study and study.count == found["episodes"] == row.scores[metric].count == len(own) == count
             assert found["mean"] == row.scores[metric].mean == study.value == pytest.approx(own["value"].mean())
             assert study.interval() == (row.scores[metric].low, row.scores[metric].high) == (found["low"], found["high"])
-        assert "leave the mean of Strict keypoint error: task2." in table.notes
+        assert "(Strict keypoint error: task2)." in table.notes
         assert table.notes in run_table(table, scores.metrics).caption
-    assert "leave the mean of keypoint_error_strict: task2." in to_markdown(summary)
-    assert "leave the mean of Strict keypoint error: task2." in grades.notes
+    assert "(keypoint_error_strict: task2)." in to_markdown(summary)
+    assert "(Strict keypoint error: task2)." in grades.notes
     alone = rows[rows["model"] != COPY]
     assert summarize_robots(alone).power.empty, "without the baseline nothing is known, and all tasks stay"
 
@@ -229,5 +229,5 @@ def test_robots_that_are_pooled_are_the_same_in_a_run_and_a_study(tmp_path: Path
     for row in table.rows:
         for metric, score in row.scores.items():
             name = " ".join(filter(None, (row.model, row.condition)))
-            mean = grades.baseline(name, SEEN_ROBOTS, metric)
+            mean = grades.variant_mean(name, SEEN_ROBOTS, metric)
             assert mean and (mean.value, *mean.interval(), mean.count) == (score.mean, score.low, score.high, score.count)

@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 from scipy import stats
 
-from xew.statistics import (
+from xew.statistics.bootstrap import (
     DRAWS,
     MIN_SCENES,
     Mean,

@@ -32,7 +32,6 @@ class Correlation:
     bootstrap_low: float
     """2.5 % of r over all draws of the robots. Not in the paper."""
     bootstrap_high: float
-    """97.5 % of them."""
 
     @property
     def stable(self) -> bool:
@@ -46,7 +45,7 @@ def loeo_correlation(distance: Sequence[float], score: Sequence[float], higher_i
     Args:
         distance: five numbers, one a robot.
         score: five numbers in the same order.
-        higher_is_better: of the score; its sign is turned, so that a positive r always means that farther is worse.
+        higher_is_better: of the score; its sign is turned, so a positive r always means that farther is worse.
 
     Raises:
         ValueError: not five finite numbers each, or one of the two does not vary (also when one robot is left out).
@@ -63,12 +62,10 @@ def loeo_correlation(distance: Sequence[float], score: Sequence[float], higher_i
 
 
 def dof_correlation(dof: Sequence[float], score: Sequence[float], higher_is_better: bool = False) -> float:
-    """Pearson's r of the number of joints with the score, positive for: more joints, worse.
+    """Pearson's r of the number of joints with the score; positive means that more joints are worse.
 
-    A diagnostic only: one robot of the five has another number than the rest, so without it nothing is left to correlate.
-
-    Raises:
-        ValueError: not five finite numbers each, or one of the two does not vary.
+    A diagnostic only: without the one robot with another number of joints nothing is left to correlate. Raises ValueError as
+    `loeo_correlation`.
     """
     x, y = _folds(dof, score)
     for name, values in (("dof", x), ("score", y)):
@@ -104,14 +101,9 @@ def permutation_p(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def exact_p(statistic: Callable[[np.ndarray], np.ndarray], scores: np.ndarray) -> float:
-    """Exact two-sided p of a statistic of scores that are paired with robots.
+    """Exact two-sided p of a statistic of scores [... 5] float64 that are paired with robots.
 
-    Args:
-        statistic: of scores [... 5] float64 in the order of the robots, to [...]; 0 says nothing.
-        scores: those observed [5].
-
-    Returns:
-        The share of all 120 orders of the scores whose statistic is as far from 0; ties up to rounding count as as far.
+    It is the share of all 120 orders of the observed scores [5] whose statistic is as far from 0; ties up to rounding count.
     """
     others = np.abs(statistic(scores[ORDERS]))
     return float((others >= np.abs(statistic(scores)) - 1e-12).mean())

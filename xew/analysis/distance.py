@@ -1,12 +1,11 @@
-"""Distances between robots, by what they can reach and by what they look like: the command, and the functions behind it.
+"""Distances between robots by reach and appearance: the command.
 
-    python -m xew.analysis.distance --out distances                    # the five robots, with the paper's figures beside
-    python -m xew.analysis.distance --robot lab/my_arm.urdf --out out  # and a robot of your own
+    python -m xew.analysis.distance --out distances                    # the five robots, with the paper's values
+    python -m xew.analysis.distance --robot lab/my_arm.urdf --out out  # and a custom robot
     python -m xew.analysis.distance --robot body:0-3 --out out         # and four procedural bodies
 
-Writes <out>/distances.csv, one row per axis and pair of robots, and <out>/robots.csv, one row per robot and feature: value,
-spread (of kinematic figures the standard deviation of one draw of configurations, over seeds; of appearance the jackknife's
-standard error over views) and the figure that the paper prints.
+Writes <out>/distances.csv (axis and pair of robots) and <out>/robots.csv (robot and feature), each with value, spread and the
+paper's value. The spread is the standard deviation over draws of configurations, of appearance the jackknife's over views.
 """
 
 import importlib
@@ -81,7 +80,7 @@ class Args:
     """Distances between robots, by what they can reach and what they look like."""
 
     robot: tuple[str, ...] = ()
-    """Robots beside the five: body:17 or a range as body:0-3, a path (.urdf, folder with robot.yaml), or module:NAME."""
+    """Robots to add to the five: body:17 or a range as body:0-3, a path (.urdf, folder with robot.yaml), or module:NAME."""
     out: Path = Path("distances")
     """Folder for distances.csv and robots.csv."""
     seeds: int = 100
@@ -125,9 +124,7 @@ def write_distances(args: Args, robots: dict[str, RobotSpec | Urdf], embed: Imag
 
 
 def find_robots(names: Iterable[str]) -> dict[str, RobotSpec | Urdf]:
-    """Robots by key, range of bodies, path or module:NAME, under their own keys.
-
-    A URDF that is not a complete robot for the simulation, for example because it has no gripper, still has a workspace.
+    """Robots by key, range of bodies, path or module:NAME; a URDF without a gripper is enough for a workspace.
 
     Raises:
         ConfigError: there is no such robot, or two have the same name.
@@ -143,7 +140,6 @@ def find_robots(names: Iterable[str]) -> dict[str, RobotSpec | Urdf]:
 
 
 def _measure_looks(specs: Sequence[RobotSpec], embed: ImageEmbedding | None) -> dict[str, Axis]:
-    """Distances of appearance between robots."""
     from xew.sim_warp.rendering.streams import VIEW_COUNT, nine_views  # loads Warp, which no other part of the analysis needs
 
     renders, robots = [nine_views(robot) for robot in specs], tuple(robot.key for robot in specs)
@@ -159,7 +155,6 @@ def _measure_looks(specs: Sequence[RobotSpec], embed: ImageEmbedding | None) -> 
 
 
 def _measure_perceptual(renders: Sequence[np.ndarray], embed: ImageEmbedding) -> np.ndarray:
-    """`perceptual_matrices`, with a ConfigError where the weights of the embedding are not installed."""
     try:
         return perceptual_matrices(renders, embed)
     except FileNotFoundError as error:  # the weights

@@ -47,7 +47,6 @@ class PublishedRobot:
     kinematic: float
     """Mean kinematic distance [m]."""
     appearance: float
-    """Mean appearance distance."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +90,6 @@ class PublishedChange:
     """A percentage of the text: the change of a score from one row to another, as a share of the value before."""
 
     source: str
-    """Section that prints it."""
     metric: str
     before: str
     """Place (part/key/robot) of the value before."""
@@ -110,12 +108,9 @@ class Paper:
 
     title: str
     tables: Mapping[str, str]
-    """Source of each group of figures."""
     half_digit: float
-    """Half a unit of the last printed decimal."""
     robots: Mapping[str, PublishedRobot]
     distances: Mapping[str, Sequence[Sequence[float]]]
-    """Symmetric matrix by axis, in the order of `robots`."""
     metrics: Mapping[str, PublishedMetric]
     parts: Mapping[str, PublishedPart]
     changes: Sequence[PublishedChange]
@@ -157,4 +152,3 @@ def read_paper() -> Paper:
 
 
 PAPER_TITLES = {name: metric.title for name, metric in read_paper().metrics.items()}
-"""Titles of the paper's metrics, in its order."""

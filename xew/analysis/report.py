@@ -32,9 +32,11 @@ from xew.analysis.paper import read_paper
 from xew.analysis.reports import page, pictures
 from xew.analysis.reports import paper as paper_report
 from xew.analysis.reports import study as report_study
+from xew.analysis.reports.answer import answer, answer_strip, best_row, run_contests
 from xew.analysis.reports.charts import Chart, chart_files
 from xew.analysis.reports.run_tables import RobotTable, Row, finding, flat_summary, robot_table
 from xew.analysis.reports.study_charts import run_chart
+from xew.analysis.reports.study_strips import Strip
 from xew.analysis.reports.study_text import curves_note, missing_note
 from xew.analysis.scores import TRUTH, MetricInfo, Scores, find_missing_scores, read_scores
 from xew.analysis.tables import formats
@@ -60,25 +62,28 @@ from xew.statistics import MIN_SCENES, find_parting, strict_metrics
 
 TITLE = "Can the model render a robot that it has never seen?"
 STRIP_METRIC = "lpips"
-"""Metric that ranks episodes, so that strips show the best, the median and the worst."""
+"""Metric that ranks episodes, so strips show the best, the median and the worst."""
 FRAME_ZERO = {
     "given": "frame 0 is given to the model and never scored",
     "absent": "frame 0, which the model was given and its videos leave out, is never scored",
     "predicted": "frame 0 is predicted too, and scored as all others",
 }
 CURVE_METRICS = ("lpips", "psnr", "mask_iou")
-"""Metrics whose error is drawn by frame."""
 FILES = ("index.html", "report.md", "*.csv", "figures/*", "tables/*")
 """Patterns of the paths of what is written into the folder of a report."""
 NO_FILE_NAME = re.compile(r"[<>\"/\\|?*()\[\]`']+")
 """Letters of the names of models that stand in no name of a figure's file."""
+Rollouts = Mapping[tuple[str, str, str, int, str], Rollout]
+"""Rollouts by model, condition, task, seed and robot."""
+MIDDLE = ("median", "the only episode")
+"""Names of the middle one of ranked episodes."""
 EXPLORER = "explorer/index.html"
 """Path of the explorer's page below the report's folder."""
 
 
 @dataclass(frozen=True)
 class Args:
-    """Turn a score table into one HTML page, with Markdown and CSV beside it."""
+    """Turn a score table into one HTML page, with Markdown and CSV next to it."""
 
     scores: Annotated[Path | None, tyro.conf.Positional] = None
     """Score table that python -m xew.metrics.evaluate made; needed unless --paper is given."""
@@ -89,11 +94,11 @@ class Args:
     out: Path = Path("report")
     """Folder to write."""
     held_out: tuple[str, ...] = HELD_OUT_ROBOTS
-    """Robots that the models have not seen; each has a table of its own, as have all robots that are not the paper's."""
+    """Robots that the models have not seen; each has its own table, and so has every custom robot."""
     distances: Path | None = None
     """Folder that python -m xew.analysis.distance wrote, for a study; without it the paper's distances are used."""
     other_motion: Path | None = None
-    """Score table of the same study in the other kind of motion: action representations of both stand side by side."""
+    """Score table of the same study in the other kind of motion, to compare action representations."""
     explorer: bool = False
     """Write <out>/explorer too, a page that plays the scenes of the strips, for the report of one run."""
     paper: bool = False
@@ -106,7 +111,6 @@ class Picture:
 
     name: str
     image: bytes
-    """PNG file."""
     html: Markup
 
 
@@ -126,7 +130,6 @@ def main(args: Args) -> None:
 
 
 def _check_motion(args: Args, scores: Scores) -> None:
-    """Raise ConfigError or EpisodeError where the data are of another kind of motion than the scores, or of both."""
     records = [record for _, record in find_records(args.data)] if args.data else []
     motion = demand_one_motion(args.data, records) if args.data and records else scores.motion
     if motion != scores.motion:
@@ -184,7 +187,9 @@ def _report_scores(args: Args, scores: Scores) -> None:
     held_out, seen = _make_tables(scores, records, args.held_out)
     missing = find_missing_scores(scores.rows)
     notes = [*missing_note(missing), *curves_note(scores)]
-    strips = _make_strips(scores, args) if args.data and args.rollouts else []
+    rollouts = {(r.model, r.condition, r.task, r.seed, r.robot): r for root in args.rollouts for r in find_rollouts(root)}
+    strips = _make_strips(scores, args, rollouts) if args.data and args.rollouts else []
+    first = answer(list(run_contests(held_out)), _make_answer_strip(scores, args, held_out, rollouts))
     if args.explorer:
         _write_explorer(scores, args)
     curves = _curve_chart(scores, args.held_out)
@@ -197,9 +202,10 @@ def _report_scores(args: Args, scores: Scores) -> None:
         _method_section(scores, args),
     ]
     sentences = finding(held_out, seen, scores.metrics)
-    html = page.page(TITLE, sentences, [part for part in sections if part], _format_footer(scores.versions))
+    html = page.page(TITLE, sentences, [part for part in sections if part], _format_footer(scores.versions), first)
     notes += _caution_notes(held_out)
-    text, files = _write_markdown(sentences, notes, held_out, seen, scores, strips, chart_files(curves))
+    drawn = chart_files(curves) | (chart_files(first.chart) if first.chart else {})
+    text, files = _write_markdown([first.sentence, *sentences], notes, held_out, seen, scores, strips, drawn)
     if len(missing):
         files["missing.csv"] = csv_text(missing).encode()
     _write_report(args.out, html, (text, files), flat_summary(held_out + seen, scores.metrics))
@@ -233,11 +239,10 @@ def _held_out_section(tables: Sequence[RobotTable], metrics: Sequence[MetricInfo
     return page.section(
         "Robots never seen in training",
         page.paragraph(
-            "Means over episodes with 95 % bootstrap intervals; scenes (task and seed) are resampled. Against the frozen first "
-            "frame, paired by episode: ▲ better, ▼ worse, ≈ not resolved. The suite strict decides: where one of its metrics "
-            "stands beside the paper's, that has the mark, and the paper's has one in parentheses where its verdict is "
-            "another. The ceiling is the true video graded in the model's "
-            "place: what it lacks is the estimators' own error, and a smaller difference is not resolved."
+            "Means over episodes with 95 % bootstrap intervals; scenes (task and seed) are resampled. Compared with the frozen "
+            "first frame, paired by episode: ▲ better, ▼ worse, ≈ not resolved. Strict metrics decide; the paper's metric has "
+            "a mark in parentheses where its verdict differs. The true video's scores show the estimators' error, and smaller "
+            "differences are not resolved."
         ),
         *map(page.note, _caution_notes(tables)),
         *(page.table(run_table(table, metrics)) for table in tables),
@@ -245,7 +250,6 @@ def _held_out_section(tables: Sequence[RobotTable], metrics: Sequence[MetricInfo
 
 
 def _caution_notes(tables: Sequence[RobotTable]) -> list[str]:
-    """A note where episodes are few; none where there are enough."""
     few = min((table.count for table in tables), default=np.inf)
     if few < MIN_SCENES:
         return [f"Fewer than {MIN_SCENES} scenes: no intervals, and nothing is resolved."]
@@ -255,7 +259,7 @@ def _caution_notes(tables: Sequence[RobotTable]) -> list[str]:
 def _seen_section(tables: Sequence[RobotTable], metrics: Sequence[MetricInfo]) -> Markup | None:
     if not tables:
         return None
-    text = "The same model on robots that it was trained on, at test seeds: what is missing here is not embodiment."
+    text = "The same model on its training robots, at test seeds."
     return page.section("Robots seen in training", page.paragraph(text), *(page.table(run_table(t, metrics)) for t in tables))
 
 
@@ -278,18 +282,17 @@ def run_table(table: RobotTable, metrics: Sequence[MetricInfo]) -> Table:
 
 
 def _run_row(row: Row, shown: Sequence[MetricInfo], metrics: Mapping[str, MetricInfo]) -> TableRow:
-    """A model's means with their marks; a metric beside one of the suite strict has a mark only where the two part."""
+    """A model's means with their marks; a metric with a strict counterpart has a mark only where their verdicts differ."""
     strict, parting = strict_metrics(metrics), {paper for _, paper in find_parting(row.verdicts, metrics)}
     cells = []
     for metric in shown:
         word = row.verdicts.get(metric.name, "")
-        own, beside = ("" if metric.name in strict else word), (word if metric.name in parting else "")
-        cells.append(_run_cell(row, metric, own, beside))
+        own, differing = ("" if metric.name in strict else word), (word if metric.name in parting else "")
+        cells.append(_run_cell(row, metric, own, differing))
     return TableRow((row.title,), tuple(cells), row.model in BASELINES)
 
 
 def _run_cell(row: Row, metric: MetricInfo, verdict: str, parting: str) -> TableCell:
-    """A mean with the marks of a `TableCell`."""
     score = row.scores.get(metric.name)
     if score is None:
         return TableCell()
@@ -312,13 +315,13 @@ def _strip_section(strips: Sequence[Picture], args: Args) -> Markup:
         missing = "name the data and the rollouts (--data, --rollouts)"
         if args.data and args.rollouts:
             missing = f"no held-out robot has a score of {STRIP_METRIC}, by which episodes are chosen; grade it too (--metrics)"
-        return page.section("What it looks like", page.note(f"No pictures: {missing}."))
+        return page.section("Best, median and worst episodes", page.note(f"No pictures: {missing}."))
     text = (
-        "Best, median and worst episode of each held-out robot by LPIPS. The difference is the largest of the three "
-        f"channels, white for none, black for {pictures.DIFFERENCE_FULL} of 255 levels or more."
+        "Episodes of each held-out robot, ranked by LPIPS. The difference is the largest of the three "
+        f"channels: white for none, black for {pictures.DIFFERENCE_FULL} of 255 levels or more."
     )
     played = [page.link("All robots' videos of these scenes side by side, as they run", EXPLORER)] if args.explorer else []
-    return page.section("What it looks like", page.paragraph(text), *played, *(strip.html for strip in strips))
+    return page.section("Best, median and worst episodes", page.paragraph(text), *played, *(strip.html for strip in strips))
 
 
 def _method_section(scores: Scores, args: Args) -> Markup:
@@ -334,7 +337,6 @@ def _method_section(scores: Scores, args: Args) -> Markup:
 
 
 def _choose_episodes(scores: Scores, held_out: Sequence[str]) -> list[tuple[str, pd.Series]]:
-    """Up to three episodes of each held-out robot and model, each with what it is of them."""
     rows = scores.rows[(scores.rows["metric"] == STRIP_METRIC) & scores.rows["robot"].isin(held_out)]
     rows = rows[~rows["model"].isin(BASELINES)]
     return [pair for _, group in rows.groupby(["robot", "model", "condition"]) for pair in _rank_episodes(group)]
@@ -355,10 +357,19 @@ def _write_explorer(scores: Scores, args: Args) -> None:
         write_page(Page(TITLE, scenes, left_out, predictions, flow=False, given=given), (args.out / EXPLORER).parent)
 
 
-def _make_strips(scores: Scores, args: Args) -> list[Picture]:
-    """Make the strips of the chosen episodes."""
+def _make_answer_strip(scores: Scores, args: Args, tables: Sequence[RobotTable], rollouts: Rollouts) -> Strip | None:
+    episodes: dict[str, tuple[Path, Rollout]] = {}
+    for word, row in _choose_episodes(scores, args.held_out) if args.data else ():
+        title = robot_title(row["robot"])
+        best = next((best_row(table) for table in tables if table.title == title), None)
+        key = _rollout_key(row)
+        if args.data and best and word in MIDDLE and key[:2] == (best.model, best.condition) and key in rollouts:
+            episodes[title] = episode_folder(args.data, *key[2:]), rollouts[key]
+    return answer_strip(episodes, scores.frame_zero)
+
+
+def _make_strips(scores: Scores, args: Args, rollouts: Rollouts) -> list[Picture]:
     assert args.data is not None
-    rollouts = {(r.model, r.condition, r.task, r.seed, r.robot): r for root in args.rollouts for r in find_rollouts(root)}
     shown = tqdm(_choose_episodes(scores, args.held_out), desc="strips", unit="strip", disable=None)
     return [_make_strip(row, word, rollouts, args.data, scores.frame_zero) for word, row in shown]
 
@@ -366,16 +377,18 @@ def _make_strips(scores: Scores, args: Args) -> list[Picture]:
 def _rank_episodes(group: pd.DataFrame) -> list[tuple[str, pd.Series]]:
     """Best, median and worst row by the ranking metric (lower is better); fewer where there are fewer."""
     if len(group) == 1:
-        return [("the only episode", group.iloc[0])]
+        return [(MIDDLE[1], group.iloc[0])]
     ordered = group.sort_values(["value", "task", "seed"])
-    places = {0: "best", len(ordered) // 2: "median", len(ordered) - 1: "worst"}
-    return [(word, ordered.iloc[place]) for place, word in sorted(places.items())]
+    words = {0: "best", len(ordered) // 2: MIDDLE[0], len(ordered) - 1: "worst"}
+    return [(word, ordered.iloc[rank]) for rank, word in sorted(words.items())]
 
 
-def _make_strip(
-    row: pd.Series, word: str, rollouts: dict[tuple[str, str, str, int, str], Rollout], data: Path, frame_zero: str
-) -> Picture:
-    key = (row["model"], row["condition"], row["task"], int(row["seed"]), row["robot"])
+def _rollout_key(row: pd.Series) -> tuple[str, str, str, int, str]:
+    return row["model"], row["condition"], row["task"], int(row["seed"]), row["robot"]
+
+
+def _make_strip(row: pd.Series, word: str, rollouts: Rollouts, data: Path, frame_zero: str) -> Picture:
+    key = _rollout_key(row)
     if key not in rollouts:
         raise ConfigError(f"the rollout {' '.join(map(str, key))} is graded but not under --rollouts; name its tree too.")
     observed = read_video(episode_folder(data, *key[2:]) / "rgb.mkv")
@@ -411,9 +424,8 @@ def _write_markdown(
     figures: Sequence[Picture],
     charts: Mapping[str, bytes],
 ) -> tuple[str, dict[str, bytes]]:
-    """The text of report.md, and the files beside it."""
-    told = [f"- {plain_markdown(sentence)}" for sentence in sentences]
-    lines = [f"# {TITLE}", "", *told, *(f"\n> {plain_markdown(note)}" for note in notes)]
+    bullets = [f"- {plain_markdown(sentence)}" for sentence in sentences]
+    lines = [f"# {TITLE}", "", *bullets, *(f"\n> {plain_markdown(note)}" for note in notes)]
     made: list[Table] = []
     for heading, tables in (("Robots never seen in training", held_out), ("Robots seen in training", seen)):
         shown = [run_table(table, scores.metrics) for table in tables]
@@ -428,7 +440,7 @@ def _write_markdown(
 
 
 def _write_report(out: Path, html: str, markdown: tuple[str, Mapping[str, bytes]], summary: pd.DataFrame) -> None:
-    """Write all files, the page last, so that everything it speaks of exists once it does."""
+    """Write all files, the page last, so it refers to existing files."""
     text, files = markdown
     try:
         for name, content in files.items():

@@ -1,9 +1,8 @@
-"""Score tables: reading, checking and merging them. Rows that are wrong are named, never averaged over.
+"""Score tables: reading, checking and merging them. Errors name the wrong rows.
 
-A study's table is several runs' tables as one: `merge_scores` adds the column `variant`, which names the trained model of
-each row (xew.protocol.Variant) and is empty for the two baselines, which belong to no model. Where variants were trained
-several times, the column `training` has the seed of the training; it is 0 for baselines. In tables without that column every
-variant has one training.
+A study's table merges several runs' tables. Its column `variant` names the trained model of each row (xew.protocol.Variant) and
+is empty for baselines. The column `training` holds the seed of the training run, 0 for baselines; it is absent if every variant
+was trained once.
 """
 
 from collections.abc import Hashable, Mapping, Sequence
@@ -25,14 +24,12 @@ TRAINING = "training"
 EPISODE = ["task", "seed", "robot"]
 KEY = ["model", "condition", *EPISODE]
 NAMES = [VARIANT, "model", "condition", "task", "robot", "metric"]
-"""Names of the columns of text."""
 COLUMNS = [*KEY, "metric", "value", "frames", "exact_frames"]
 COPY, TRUTH = COPY_FIRST_FRAME, GROUND_TRUTH
 """Baselines that others are measured by: the frozen first frame, and the true video, which is the ceiling."""
 COMPARABLE = ("protocol", "metrics", "estimators", "frame_zero", "motion")
 """Attributes that say how a table was graded, and on what motion; tables that differ in one cannot be compared."""
 REQUIRED = ("dimension", "unit", "higher_is_better", "low", "high", "reference", "estimated")
-"""Attributes of each metric that every table has."""
 LISTED = 20
 """Largest number of rows of each kind that an error names; it counts the others."""
 
@@ -53,9 +50,8 @@ class MetricInfo:
     title: str = ""
     """Title in tables and charts; its name where the table gives none."""
     estimated: bool = False
-    """Whether it needs an estimator, so that even the true video does not get the best score."""
+    """Whether it needs an estimator, so even the true video does not get the best score."""
     suites: tuple[str, ...] = ()
-    """Suites that it belongs to."""
     counterpart: str = ""
     """Name of the metric of the suite paper in whose place it stands in the suite strict, and decides."""
     reported: bool = False
@@ -137,16 +133,14 @@ class Scores:
 
 
 def read_scores(path: Path, own_robots: Sequence[str] = ()) -> Scores:
-    """Read and check a score table, and its curves where they are there.
+    """Read and check a score table, and its curves if they exist.
 
     Args:
-        path: what `xew.metrics.evaluate` or `write_scores` wrote.
-        own_robots: names of robots that are not the paper's; a table may also name them itself (attribute `robots`), and
-            procedural bodies and robots with an import path `module:NAME` need no further word.
+        path: file that `xew.metrics.evaluate` or `write_scores` wrote.
+        own_robots: robots that are neither the paper's, nor in the attribute `robots`, nor bodies, nor `module:NAME`.
 
     Raises:
-        ConfigError: the table is missing, or a file is damaged; or cells are duplicate, not finite, of unknown robots, of other
-            metrics than described, out of a metric's range, or graded over different numbers of frames. All are named.
+        ConfigError: a file is missing or damaged, or rows cannot be averaged over; the message names them.
     """
     command = EVALUATE.format(path=path)
     rows, by_frame = _read(path, command), path.with_suffix(".curves.parquet")
@@ -165,22 +159,19 @@ def read_scores(path: Path, own_robots: Sequence[str] = ()) -> Scores:
     known |= {robot for robot in names if IMPORT_PATH.fullmatch(str(robot)) or BODY_NAME.fullmatch(str(robot))}
     wrong = _find_wrong_rows(rows, metrics, known)
     if wrong:
-        raise ConfigError(f"{path} cannot be averaged over:\n{_format_wrong_rows(wrong)}\nGrade anew: {command} --overwrite")
+        raise ConfigError(f"{path} cannot be averaged over:\n{_format_wrong_rows(wrong)}\nGrade again: {command} --overwrite")
     return Scores(rows, curves, metrics, rows.attrs)
 
 
 def merge_scores(tables: Sequence[tuple[str, Path]], trainings: Sequence[int] = ()) -> Scores:
-    """The score tables of a study's variants as one, with the column `variant` in front.
-
-    Baselines that several tables hold are kept once; they have no variant.
+    """The score tables of a study's variants as one, with the column `variant` in front; shared baselines are kept once.
 
     Args:
-        tables: variant and path of its score table; a variant may have several.
-        trainings: seed of the training that each table is of, for the column `training`; without them there is none.
+        tables: variant and path of each score table.
+        trainings: seed of each table's training run, for the column `training`; empty for no such column.
 
     Raises:
-        ConfigError: a table cannot be read; tables were graded by different protocols, metrics or estimators; or cells
-            occur twice in a variant or differ in frames between variants. All are named.
+        ConfigError: a table cannot be read, tables were graded differently, or cells are duplicate or differ in frames.
     """
     if not tables:
         raise ConfigError("there is no score table to merge; grade at least one variant's rollouts first.")
@@ -206,13 +197,13 @@ def merge_scores(tables: Sequence[tuple[str, Path]], trainings: Sequence[int] = 
     if wrong:
         paths = ", ".join(str(path) for _, path in tables)
         raise ConfigError(
-            f"the score tables {paths} do not go together:\n{_format_wrong_rows(wrong)}\nGrade them anew from one data set."
+            f"the score tables {paths} do not match:\n{_format_wrong_rows(wrong)}\nGrade them again from one data set."
         )
     return Scores(merged, _stack_compact_tables(curves), metrics, common)
 
 
 def write_scores(scores: Scores, path: Path) -> None:
-    """Write a table and its curves, each file whole or not at all, so that `read_scores` reads them back.
+    """Write a table and its curves, each file whole or not at all, so `read_scores` reads them back.
 
     Raises:
         ConfigError: they cannot be written there.
@@ -228,13 +219,9 @@ def write_scores(scores: Scores, path: Path) -> None:
 
 
 def find_missing_scores(rows: pd.DataFrame) -> pd.DataFrame:
-    """Find scores that some models have and others lack: means over such cells would compare different episodes.
+    """Scores that some models have and others lack: columns [variant] [training] model condition task seed robot metric.
 
-    A model (of a variant and condition) that has a score of a robot is expected to have all scores that any other has of
-    this robot. Whole robots that it was never asked for are the protocol's to count (xew.protocol).
-
-    Returns:
-        Columns [variant] [training] model condition task seed robot metric, one row for each missing score, in order.
+    A model with a score on a robot is expected to have all scores that any other model has on this robot.
     """
     who = [column for column in (VARIANT, TRAINING, "model", "condition") if column in rows]
     asked = rows[[*who, "robot"]].drop_duplicates()
@@ -259,7 +246,7 @@ def _read(path: Path, command: str) -> pd.DataFrame:
     except FileNotFoundError as error:
         raise ConfigError(f"{path} does not exist; make it: {command}") from error
     except (OSError, ValueError, TypeError, AttributeError, RecursionError) as error:  # the latter of damaged attributes
-        raise ConfigError(f"{path} cannot be read ({error}); delete it and make it anew: {command}") from error
+        raise ConfigError(f"{path} cannot be read ({error}); delete it and make it again: {command}") from error
 
 
 def _check_texts(path: Path, rows: pd.DataFrame) -> None:
@@ -277,7 +264,6 @@ def _check_texts(path: Path, rows: pd.DataFrame) -> None:
 
 
 def _read_metric_infos(path: Path, described: Mapping[str, Mapping[str, Any]]) -> tuple[MetricInfo, ...]:
-    """Read the descriptions of a table's metrics; further entries are ignored."""
     known = {field.name for field in fields(MetricInfo)} - {"name"}
     for metric, info in described.items():
         if missing := [name for name in REQUIRED if name not in info]:
@@ -309,7 +295,6 @@ class _Attributes:
 
 
 def _check_attributes(path: Path, attributes: Mapping[Hashable, Any]) -> None:
-    """Raise ConfigError for attributes of other types than they have."""
     known = {entry.name for entry in fields(_Attributes)}
     parse(_Attributes, {name: value for name, value in attributes.items() if name in known}, f"{path}, its attributes")
 
@@ -393,7 +378,6 @@ def _select_curves(curves: pd.DataFrame, rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def _add_variant_column(variant: str, seed: int | None, table: pd.DataFrame) -> pd.DataFrame:
-    """A table with its variant in front, and the seed of its training if there is one; baselines have none."""
     baseline = table["model"].isin(BASELINES)
     named = table.assign(**{VARIANT: np.where(baseline, "", variant)})[[VARIANT, *table.columns]]
     if seed is not None:
@@ -408,7 +392,6 @@ def _compact_names(curves: pd.DataFrame) -> pd.DataFrame:
 
 
 def _stack_compact_tables(tables: Sequence[pd.DataFrame]) -> pd.DataFrame:
-    """Compact tables, one below the other, still compact."""
     known = {name: sorted(set().union(*(table[name].cat.categories for table in tables))) for name in NAMES}
     alike = [table.astype({name: pd.CategoricalDtype(known[name]) for name in NAMES}) for table in tables]
     return pd.concat(alike, ignore_index=True)

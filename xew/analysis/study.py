@@ -5,8 +5,8 @@ Writes <out>/: data, latents, configs, runs, rollouts, scores; scores.parquet, r
 
     python -m xew.analysis.study configs/study_debug.yaml [--dry-run] [--redo 'train/loeo_*'] [--out DIR and other overrides]
 
-Stop it at any time, also by kill -9, and give it again: what is done is skipped, what was begun goes on. A step that fails is
-named with its log; the others go on, and the exit status is 1.
+Stop it at any time and run it again: it skips what is done and resumes the rest. A failed step is named with its log; other
+steps continue, and the exit status is 1.
 """
 
 import contextlib
@@ -39,7 +39,7 @@ from xew.metrics.grading.weights import check_weights
 from xew.model.experiment import load_experiment
 user_errors(lambda: [check_weights(), *map(load_experiment, sys.argv[1:])])()
 """
-"""Program that checks experiments, and that what metrics need is installed, in a process of its own, since the analysis does
+"""Program that checks experiments, and that what metrics need is installed, in its own process, since the analysis does
 not import the model."""
 
 
@@ -55,15 +55,15 @@ class Args:
     study: Annotated[Study, tyro.conf.arg(name="")]
     """The study that the file describes, with overrides."""
     dry_run: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Show what is done, what is to do and what it takes, and do nothing."""
+    """Show what is done, what is left and its cost, and run nothing."""
     redo: Annotated[tuple[str, ...], tyro.conf.arg(metavar="STEP [STEP ...]")] = ()
-    """Steps to make anew, such as 'train/loeo_*'."""
+    """Run these steps again, such as 'train/loeo_*'."""
     minutes: Annotated[float | None, tyro.conf.arg(metavar="{None}|FLOAT")] = None
-    """Time that this run may take: by the estimates nothing is begun that would not be graded by then."""
+    """Time limit: start no step that would not be graded by then, as estimated."""
     only: tuple[str, ...] = ()
-    """Kinds of steps to run now, such as 'generate latents train rollout'; all where left out."""
+    """Kinds of steps to run, such as 'generate latents train rollout'; default: all."""
     merge: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="PIECE [PIECE ...]")] = ()
-    """Folders of the same study from other machines: what they have done is taken over, and nothing is run."""
+    """Merge these folders of the same study from other machines, and run nothing."""
 
 
 @user_errors
@@ -109,7 +109,7 @@ def merge_pieces(steps: Mapping[str, Step], ledger: Ledger, pieces: Sequence[Pat
 
 
 def read_arguments(arguments: Sequence[str]) -> Args:
-    """The command line, with the study that its config and overrides describe; --help lists all that may be overridden.
+    """The command line with the study of its config and overrides.
 
     Raises:
         ConfigError: the config cannot be read, or the study names something that does not exist.
@@ -166,12 +166,7 @@ def select_steps(steps: Mapping[str, Step], patterns: Sequence[str]) -> list[Ste
 
 @contextlib.contextmanager
 def lock_study(out: Path) -> Iterator[None]:
-    """Make a study's folder and hold its lock.
-
-    Raises:
-        ConfigError: it cannot be made.
-        EpisodeError: another process runs a study in it; the message says which.
-    """
+    """Make a study's folder and hold its lock. Raises ConfigError or, if another process runs it, EpisodeError."""
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -1,11 +1,9 @@
-"""The end of a study: the score tables of its variants as one, and the report on it.
+"""The end of a study: its merged score table, with the plan in its attribute `study`, and the report.
 
 Reads  <study>/study.yaml, scores/<variant>.parquet, data, rollouts
 Writes <study>/scores.parquet with the column `variant`, its curves, and report/
 
     python -m xew.analysis.study_analyse STUDY [VARIANT ...]
-
-The merged table says in its attribute `study` what was planned, so that whoever reads it can tell what is missing.
 """
 
 from dataclasses import dataclass, replace
@@ -29,15 +27,15 @@ class Args:
     study: Annotated[Path, tyro.conf.Positional]
     """Folder of the study."""
     variants: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
-    """Trainings of variants that are graded; all that have scores where left out."""
+    """Training runs to report; default: all that have scores."""
     rollouts: Path | None = None
-    """Folder of rollouts by variant, for pictures; <study>/rollouts where left out. Some scenes of some variants are enough."""
+    """Folder of rollouts by variant, for pictures; default: <study>/rollouts. Some scenes of some variants suffice."""
     data: Path | None = None
     """Data set that holds these scenes; the study's where left out."""
     distances: Path | None = None
     """Folder of python -m xew.analysis.distance; without it the report has the paper's distances."""
     trust: tuple[str, ...] = ()
-    """Modules of your own tasks, such as my_lab.tasks, that the study may name."""
+    """Modules with custom tasks, such as my_lab.tasks, that the study may name."""
 
 
 @user_errors
@@ -81,12 +79,10 @@ def merge_and_report(args: Args, study: Study) -> None:
 
 
 def describe(study: Study, scores: Scores) -> dict[str, Any]:
-    """What the merged table says about its study, as plain JSON.
+    """The merged table's description of its study, as plain JSON.
 
-    Returns:
-        `parts`, `tasks` (number), `robots`, `train_seeds`, `test_seeds`, `shots`, `training_seeds`: the extent; `of_paper`:
-        whether it is the paper's; `variants`: for each planned one, `expected` and `found` scored episodes of each robot;
-        `incomplete`: names of those that lack any, against the study's own extent.
+    `variants` has `expected` and `found` scored episodes of each robot; `incomplete` names variants that lack any; `of_paper`
+    says whether the extent is the paper's.
     """
     cell = [VARIANT, "task", "seed", "robot"]
     graded = scores.rows[[*cell, *([TRAINING] if TRAINING in scores.rows else [])]].drop_duplicates().groupby(cell).size()

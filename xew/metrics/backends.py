@@ -1,12 +1,13 @@
-"""Estimators to choose from: who finds the robot, its points and its motion in a video that has no ground truth.
+"""Registries of estimators, which find the robot, its points and its motion in a predicted video.
 
-Reads  local checkpoints, where an estimator has one; nothing is ever downloaded
+Reads  local checkpoints; nothing is ever downloaded
 To add one: its file, and one line in MASKERS, TRACKERS or FLOWS; from outside the repo, `module:NAME` of a `Backend`.
 
     masker = open_masker("sam2", Path("weights/sam2.1_hiera_large.pt"))
     masks = masker(prediction, target, target_mask)
 """
 
+import importlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -37,10 +38,11 @@ class Masker(Protocol):
 
 @runtime_checkable
 class Tracker(Protocol):
-    """Where the true video's points are in a predicted video.
+    """Positions of the true video's points in a predicted video.
 
-    One that finds each point without regard to the others has the attribute `pointwise = True`, and is then asked for points
-    of all kinds in one pass.
+    The attribute `pointwise = True` says that each point is found without regard to the others: points of all kinds then come
+    in one
+    call. An optional method `confirm` replaces `presence.confirm_tracks`, with the same arguments.
     """
 
     def __call__(self, prediction: np.ndarray, target: np.ndarray, points: np.ndarray, visible: np.ndarray) -> np.ndarray:
@@ -53,34 +55,8 @@ class Tracker(Protocol):
         """
 
 
-@runtime_checkable
-class Confirmer(Protocol):
-    """A tracker that also confirms that its tracks show the points' bodies, as `presence.confirm_tracks` does."""
-
-    def confirm(
-        self,
-        tracks: np.ndarray,
-        prediction: np.ndarray,
-        target: np.ndarray,
-        points: np.ndarray,
-        visible: np.ndarray,
-        body_id: np.ndarray,
-        body: np.ndarray,
-    ) -> np.ndarray:
-        """Tracks [t k 2] without the places that do not show the point's body.
-
-        Args:
-            tracks: [t k 2] float32 pixels, as the tracker gave them for the same videos and points.
-            prediction, target, points, visible, body_id, body: as of `presence.confirm_tracks`.
-        """
-
-
-@runtime_checkable
-class Flow(Protocol):
-    """Optical flow between pairs of images."""
-
-    def __call__(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-        """Where each pixel of `start` goes: float32 [n h w 2] pixels (x right, y down), of two [n h w 3] uint8."""
+Flow = Callable[[np.ndarray, np.ndarray], np.ndarray]
+"""Function of two [n h w 3] uint8 to the motion of each pixel of the first: float32 [n h w 2] pixels (x right, y down)."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +68,6 @@ class Backend(Generic[T_co]):
     needs: str | None
     """Checkpoint to get, from whom, under which license; None where the estimator needs none."""
     summary: str
-    """Description in a line, for the notes under a table."""
 
 
 def open_masker(name: str, checkpoint: Path | None = None, option: str = "--masks-checkpoint") -> Masker:
@@ -111,10 +86,7 @@ def open_flow(name: str, checkpoint: Path | None = None, option: str = "the argu
 
 
 def identity(name: str, checkpoint: Path | None = None) -> str:
-    """What a score table says of the estimator that it was made with: its name, and file name and digest of its checkpoint.
-
-    The same bytes give the same text wherever they lie.
-    """
+    """An estimator's entry in score tables: its name, and file name and digest of its checkpoint, wherever it lies."""
     return name if checkpoint is None else f"{name} {checkpoint.name} sha256:{digest_tree(checkpoint)[:16]}"
 
 
@@ -136,7 +108,7 @@ def _open(backend: Backend[T], name: str, checkpoint: Path | None, option: str) 
 
 
 class ReferenceMasker:
-    """`estimate_masks`; what it makes of an episode is made once while predictions of the same episode follow each other."""
+    """`estimate_masks`, which keeps an episode while predictions of the same episode follow each other."""
 
     def __init__(self) -> None:
         self._episode: Episode | None = None
@@ -148,32 +120,22 @@ class ReferenceMasker:
         return estimate_masks(prediction, target, target_mask, self._episode)
 
 
-def _open_default_masker() -> Masker:
-    # Only in these two functions: the metrics load without Warp, whose kernels are parsed as they are imported.
+def _open_default(on_gpu: str, on_cpu: Callable[[], T]) -> T:
+    """The class `module:NAME` in xew.metrics.estimators.batched if there is a GPU, else the reference."""
+    # Only here: the metrics load without Warp, whose kernels are parsed as they are imported.
     with PARSING:
         from xew.metrics.estimators.batched.devices import find_gpu
 
         if gpu := find_gpu():
-            from xew.metrics.estimators.batched.masks import BatchedMasker
-
-            return BatchedMasker(gpu)
-    return ReferenceMasker()
-
-
-def _open_default_tracker() -> Tracker:
-    with PARSING:
-        from xew.metrics.estimators.batched.devices import find_gpu
-
-        if gpu := find_gpu():
-            from xew.metrics.estimators.batched.tracks import BatchedTracker
-
-            return BatchedTracker(gpu)
-    return ReferenceTracker()
+            module, _, name = on_gpu.partition(":")
+            opened: T = getattr(importlib.import_module(f"xew.metrics.estimators.batched.{module}"), name)(gpu)
+            return opened
+    return on_cpu()
 
 
 MASKERS: Mapping[str, Backend[Masker]] = {
     "default": Backend(
-        _open_default_masker,
+        lambda: _open_default("masks:BatchedMasker", ReferenceMasker),
         None,
         "color, background and gated flow against the true video (xew.metrics.estimators.masks); in Warp kernels "
         "where there is a GPU, else opencv",
@@ -188,7 +150,7 @@ MASKERS: Mapping[str, Backend[Masker]] = {
 }
 TRACKERS: Mapping[str, Backend[Tracker]] = {
     "default": Backend(
-        _open_default_tracker,
+        lambda: _open_default("tracks:BatchedTracker", ReferenceTracker),
         None,
         "template search against the true video (xew.metrics.estimators.tracks); in Warp kernels where there is a GPU, "
         "else opencv",

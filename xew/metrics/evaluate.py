@@ -61,11 +61,7 @@ def grade_tables(args: Args) -> None:
 
 
 def check(args: Args, path: Path) -> None:
-    """Check a bundle against itself, against rollouts and data where they are named, and against scores graded again.
-
-    Raises:
-        ConfigError: something does not hold; the message says what.
-    """
+    """Check a bundle against itself, and against rollouts, data and new grading if they are named. Raises ConfigError."""
     bundle = read_bundle(path)
     print(f"{path}: {len(bundle['samples'])} videos, whole, and its means are those of its values")
     if not args.rollouts:
@@ -89,7 +85,6 @@ def check(args: Args, path: Path) -> None:
 
 
 def _demand_codecs(path: Path, bundle: Bundle, args: Args) -> None:
-    """Raise ConfigError where a bundle has the truth through codecs of runs that are not named."""
     if bundle.get("codecs") and not args.codec:
         raise ConfigError(
             f"{path} has the truth through the codecs of {', '.join(sorted(bundle['codecs']))}; name these runs: --codec RUN."

@@ -1,4 +1,4 @@
-"""The scores of one video: a prediction is compared with the episode that it predicts, by estimators and then by metrics.
+"""The scores of one video, compared with its episode by estimators and metrics.
 
 grades = grade(Comparison(video, EpisodeCache(truth), masker, tracker), ("psnr", "mask_iou"))
 """
@@ -14,14 +14,14 @@ import jax
 import numpy as np
 
 from xew.metrics import METRICS
-from xew.metrics.backends import Confirmer, Masker, Tracker
+from xew.metrics.backends import Masker, Tracker
 from xew.metrics.episode_cache import EpisodeCache, GradedVideo, cut_blocks, fill_up, is_on_cpu
 from xew.metrics.estimators.presence import confirm_tracks
 from xew.metrics.perceptual import SMALLEST_SIDE, Box, lpips, region_lpips_frames, robot_lpips_frames, union_box
 from xew.metrics.truth import Points, Truth
 
 TRACK_BLOCK, POINT_BLOCK = 64, 32
-"""Numbers of frames and points that tracks are filled up to multiples of, so that videos of all lengths and robots share a few
+"""Numbers of frames and points that tracks are filled up to multiples of, so videos of all lengths and robots share a few
 programs: compiling one takes seconds, running it milliseconds."""
 ON_SURFACES = ("robot_points", "object_points")
 """Kinds of points that are tracked in one pass, by any tracker."""
@@ -95,9 +95,9 @@ class Comparison:
         return self.masker(self._estimator_input, self.truth.rgb, self.truth.mask)
 
     def track(self, kind: str) -> np.ndarray:
-        """Where the tracker finds the points of a kind [t k 2] pixels, NaN where lost or hidden in the truth.
+        """Tracks of the points of a kind [t k 2] pixels, NaN where lost or hidden in the truth.
 
-        Raises ValueError where the truth was read without them.
+        Raises ValueError if the truth was read without these points.
         """
         if kind not in self.points:
             raise ValueError("the truth has no points on surfaces; ask read_truth for 'robot_points' and 'object_points'.")
@@ -111,11 +111,7 @@ class Comparison:
         return self.prediction if self.estimator_video is None else self.estimator_video
 
     def _track(self, kinds: tuple[str, ...]) -> dict[str, np.ndarray]:
-        """Tracks [t k 2] by kind, all found in one pass.
-
-        A place on a surface that does not have the color of the point's body is none, so that an object is not found by what is
-        round it.
-        """
+        """Tracks [t k 2] by kind, found in one call; places without the color of the point's body are dropped."""
         points = [self.points[kind] for kind in kinds]
         pixels, visible = (np.concatenate([getattr(some, name) for some in points], axis=1) for name in ("pixels", "visible"))
         seen = visible.any(axis=0)
@@ -127,7 +123,7 @@ class Comparison:
             body = np.concatenate([_bodies(some) for some in points])
             on_body = seen & (body >= 0)
             places = np.nan_to_num(pixels[:, on_body]), visible[:, on_body]
-            confirm = self.tracker.confirm if isinstance(self.tracker, Confirmer) else confirm_tracks
+            confirm = getattr(self.tracker, "confirm", confirm_tracks)
             body_id = self.truth.surfaces.body_id
             tracks[:, on_body] = confirm(tracks[:, on_body], *videos, *places, body_id, body[on_body])
         ends = np.cumsum([some.visible.shape[1] for some in points])
@@ -247,7 +243,6 @@ def _curves_of_features(comparison: Comparison, metrics: Collection[str], inputs
 def _feature_distances(
     comparison: Comparison, arrays: Arrays | None, box: Box | None = None
 ) -> tuple[np.ndarray, np.ndarray | None]:
-    """`SharedFeatures.distances` of a comparison's videos, and of the robot's masks where they follow in the arrays."""
     assert arrays is not None, "asked for what the truth has"
     blocks = None if is_on_cpu() else _video_blocks(comparison, arrays)
     prediction, target, *robot = arrays
@@ -262,10 +257,7 @@ def _touches_all_borders(mask: np.ndarray) -> bool:
 def _grade_tracks(
     comparison: Comparison, metrics: Collection[str], inputs: Inputs
 ) -> dict[str, tuple[float, np.ndarray | None]]:
-    """Scores and curves [t], if any, of all metrics of tracks. What is filled up is not valid, which none of them looks at.
-
-    Tracks are small, so that a GPU has nothing to gain: they are compared on the CPU.
-    """
+    """Scores and curves [t], if any, of all metrics of tracks, computed on the CPU because tracks are small."""
     scores: dict[str, tuple[float, np.ndarray | None]] = {}
     kinds = {name: input_kind(name) for name in metrics if METRICS[name].inputs == "track"}
     for kind in dict.fromkeys(kinds.values()):

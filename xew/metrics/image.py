@@ -1,7 +1,7 @@
 """Visual quality without a network: PSNR and SSIM, one value a frame.
 
-uint8 goes through integers: sums of squares and window moments are exact, so that flat bright images lose nothing to
-float32 and results agree with a float64 reference to about 1e-7. Floating input in [0, 1] is for use as a loss.
+uint8 is computed with integers: sums of squares and window moments are exact, and results agree with a float64 reference to
+about 1e-7. Floating input in [0, 1] is for use as a loss.
 """
 
 import functools
@@ -24,11 +24,9 @@ SSIM_C1, SSIM_C2 = (0.01 * 255) ** 2, (0.03 * 255) ** 2
 def psnr(prediction: Video, target: Video, *, chunk: int | None = None) -> ByFrame:
     """Peak signal-to-noise ratio of each frame [dB], higher is better.
 
-    Exact frames have no finite PSNR. As in the paper they are capped at the largest finite value among the frames they
-    are mixed with, which are here those of the same call: one video, so that no score depends on what else is graded.
-    The paper says nothing of videos that are exact throughout; they get the most that an inexact frame of this size can
-    have: one channel of one pixel off by one level (101.76 dB at 320x240). `exact_frames` says which frames these are;
-    their count belongs with the mean, which one cap can move.
+    Exact frames have no finite PSNR. As in the paper they are capped at the largest finite value among the frames of the same
+    call. If all frames are exact, the cap is the PSNR of one channel of one pixel off by one level (101.76 dB at 320x240).
+    Report the mean with the count of `exact_frames`, because a cap can move it.
 
     Args:
         prediction, target: [t h w 3] uint8, or floating in [0, 1].

@@ -1,9 +1,8 @@
 """Robot morphology by masks: IoU and boundary F1, one value a frame.
 
-Masks are packed, eight pixels of a column in a byte: contours and discs are then a few dozen operations on bytes, and
-counting is population count. All counts are integers, so the scores do not depend on the machine. Each step is a program
-of its own, and what is counted is an array, not an expression: in one program XLA would do the first steps again for each
-use, and count without vector instructions (three times the time on a CPU).
+Masks are packed, eight pixels of a column in a byte, and counted by population count. All counts are integers, so scores do not
+depend on the machine. Each step is its own program: in one program XLA repeats the first steps for each use and counts without
+vector instructions (three times the time on a CPU).
 """
 
 import functools
@@ -17,7 +16,6 @@ from jax import lax
 from xew.metrics.metric import ByFrame, Masks, check_first, check_masks
 
 BYTE = 8
-"""Number of pixels that are packed together."""
 SQUARE = (1, 1)
 """Shape of a pixel and its eight neighbors: half heights of the columns at distance 0 and 1."""
 
@@ -112,7 +110,6 @@ def _match(edge_p: jax.Array, edge_t: jax.Array, disc: tuple[int, ...]) -> list[
 
 
 def _disc(radius: int | float) -> tuple[int, ...]:
-    """Half heights of a disc's columns at distances 0, 1, ... from its center."""
     if not radius >= 0:
         raise ValueError(f"the tolerance is {radius}, expected a radius of at least 0 pixels.")
     return tuple(math.isqrt(math.floor(radius * radius) - x * x) for x in range(math.floor(radius) + 1))

@@ -1,7 +1,7 @@
-"""What a metric is, and what all metrics share: checks on arrays, and frames by the chunk.
+"""The type of a metric, and shared checks of arrays and chunks of frames.
 
-A metric compares one of INPUTS, which grade.py makes of a prediction and of the ground truth (truth.py). To add a metric of
-those, only its function and its entry in METRICS are written.
+A metric compares one of INPUTS, which grade.py prepares from a prediction and the ground truth (truth.py). To add a metric of
+these inputs, write its function and its entry in METRICS.
 """
 
 import functools
@@ -66,11 +66,9 @@ class Metric:
     dimension: str
     """Group of metrics, a key of `xew.protocol.DIMENSION_TITLES` or one of your own: reported side by side, never collapsed."""
     unit: str
-    """Unit of the number, '' where it has none."""
     range: tuple[int | float, int | float]
     """Least and largest value."""
     higher_is_better: bool
-    """Direction of the metric."""
     inputs: str
     """Kind of what the functions compare, one of `INPUTS`."""
     reference: str
@@ -80,13 +78,12 @@ class Metric:
     reported: bool = True
     """Whether a study's full tables show it; False for companions of other metrics."""
     whole: bool = False
-    """Whether its values by frame need the whole video, so that frames are never graded in blocks (PSNR, by its cap); of a
+    """Whether its values by frame need the whole video, so frames are never graded in blocks (PSNR, by its cap); of a
     metric of tracks, whether a frame has no value of its own (nDTW)."""
     parts: Callable[..., tuple[jax.Array, jax.Array]] | None = None
     """Function of the same inputs to the values that the metric is the mean of, and which of them count; None where these are
     the values by frame, or where it is a mean of means (`trajectory_error`)."""
     suites: tuple[str, ...] = tuple(SUITES)
-    """Suites that it belongs to, keys of `SUITES`."""
     counterpart: str = ""
     """Name of the metric of the suite paper in whose place it stands in the suite strict, and decides."""
     points: str = "origins"
@@ -96,7 +93,7 @@ class Metric:
 
     @property
     def estimated(self) -> bool:
-        """Does it need an estimator, so that even the true video does not get the best score?"""
+        """Does it need an estimator, so even the true video does not get the best score?"""
         return self.inputs in ESTIMATED_INPUTS
 
     @property
@@ -110,11 +107,11 @@ class Metric:
         return self.estimated and "strict" in self.suites
 
     def total(self, *inputs: AnyArray, **options: Any) -> Total:
-        """Sum and number of the values that the metric is the mean of: those of a video's parts, or of several videos, add up.
+        """Sum and number of the values that the metric averages; totals of parts of a video, or of several videos, add up.
 
         Args:
-            inputs, options: those of `function`, of all frames or of a part of them. A path cannot be cut (nDTW), and PSNR caps
-                exact frames by the frames that it is given with.
+            inputs, options: of `function`, for all frames or some. Paths cannot be cut (nDTW); PSNR caps exact frames by the
+                given ones.
 
         Raises:
             ValueError: the metric is no mean over frames or points.
@@ -127,10 +124,9 @@ class Metric:
 
 
 def check_first(check: Callable[..., None], **options: Any) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Decorate a metric with a check of its arguments, whose one-line message is what a user sees of a wrong array.
+    """Decorate a metric with a check of its arguments, so users see a one-line message for a wrong array.
 
-    It stands above jax.jit, which would turn lists into trees and values into tracers, and so runs before anything that checks
-    the function's annotations, as tests do.
+    It stands above jax.jit, and before anything that checks annotations.
 
     Args:
         check: takes some of the function's parameters, by the same names.
@@ -188,9 +184,9 @@ def _remedy_of_shape(shape: tuple[int, ...]) -> str:
 
 
 def _check_range(name: str, video: Any) -> None:
-    """Raise ValueError if the first frame of a floating video [t h w 3] is clearly not in [0, 1], as far as that is known.
+    """Raise ValueError if the first frame of a floating video [t h w 3] is clearly not in [0, 1].
 
-    The frame alone, because a whole video would take longer than its PSNR. Networks overshoot, so OVERSHOOT is let pass.
+    Only the first frame, because a whole video would take longer than its PSNR. OVERSHOOT is admitted.
     """
     if isinstance(video, jax.core.Tracer) or jnp.result_type(video) == jnp.uint8:
         return
@@ -253,17 +249,17 @@ def map_frames(function: Callable[..., Any], frames: Any, chunk: int | None) -> 
 
 
 def map_chunks(function: Callable[..., Any], frames: Any, chunk: int | None) -> Any:
-    """`function` of a chunk of frames at a time, so that memory does not grow with the video.
+    """Apply a function to chunks of frames, so memory does not grow with the video.
 
-    Chunks are of one size, so that there is one program to compile; the last is filled up with copies of the last frame.
+    Chunks have one size and need one program; the last is filled up with copies of the last frame.
 
     Args:
-        function: of some frames: the leaves of `frames` with a shorter time axis. A frame's result is its own.
+        function: of frames, whose results are independent of each other.
         frames: arrays [t ...] in any tree.
-        chunk: most frames computed at once; None for 1 on a CPU and `ACCELERATOR_CHUNK` elsewhere.
+        chunk: most frames at once; None for 1 on a CPU and `ACCELERATOR_CHUNK` elsewhere.
 
     Returns:
-        What the function returns, with a time axis [t ...].
+        The function's results, with a time axis [t ...].
 
     Raises:
         ValueError: the chunk is under 1.

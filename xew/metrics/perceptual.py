@@ -85,8 +85,8 @@ def region_lpips(
 ) -> Scalar:
     """LPIPS inside the bounding box of the union over time of the target's robot masks, mean over frames.
 
-    The box is one for the whole video, and is cut out before the network, as if the video were no larger. Under a jit of
-    the caller's, where its size is not known beforehand, a box too small gives NaN instead of the error.
+    The box is one for the whole video and is cut out before the network. Under a caller's jit a box too small gives NaN, no
+    error.
 
     Args:
         prediction, target: [t h w 3] RGB, uint8, or floating in [0, 1].
@@ -114,11 +114,10 @@ def region_lpips_frames(
 
 @check_first(check_region)
 def robot_lpips(prediction: Video, target: Video, target_mask: Masks, *, chunk: int | None = None) -> Scalar:
-    """LPIPS of what shows the robot, mean over the frames in which the target shows it; lower is better.
+    """LPIPS of the robot, mean over the frames in which the target shows it; lower is better.
 
-    LPIPS is a mean over each layer's map of distances. Here the mean is weighted, frame by frame, by the share of a unit's
-    receptive field that the robot covers in the target: a unit counts if the robot, grown by the receptive field, reaches it,
-    and the more the more robot it sees. A mask of whole frames gives LPIPS.
+    LPIPS is a mean over each layer's map of distances. Here each unit is weighted by the share of its receptive field that the
+    robot covers in the target. A mask of whole frames gives LPIPS.
 
     Args:
         prediction, target: [t h w 3] RGB, uint8, or floating in [0, 1]; sides of at least 31 pixels.
@@ -175,16 +174,14 @@ def lpips_embedding(video: Video, *, chunk: int | None = None) -> jax.Array:
 
 
 class SharedFeatures:
-    """Features of a true video's frames, made once for the LPIPS of whole frames, of the robot and of its box, and for all
-    predictions that are graded after one another.
+    """Features of a true video's frames, computed once for all LPIPS metrics and all predictions.
 
-    On a CPU, where frames come one by one, a frame's features have the same bits alone and with another's, so the
-    numbers are those of `lpips` and `region_lpips_frames`. Those of `robot_lpips_frames` may differ in the last bit: the
-    compiler adds what is weighted in another order. In blocks of frames all are within 1e-6.
+    Frame by frame on a CPU the numbers are exactly those of `lpips` and `region_lpips_frames`; `robot_lpips_frames` may differ
+    in the last bit. In blocks of frames all agree within 1e-6.
     """
 
     def __init__(self, most_bytes: int) -> None:
-        """Keep features of the true video up to this size [bytes]; those of further frames are made again each time."""
+        """Keep features of the true video up to this size [bytes]; others are computed again each time."""
         self._left = most_bytes
         self._true: dict[tuple[int, tuple[int, ...]], Layers] = {}
 
@@ -196,15 +193,13 @@ class SharedFeatures:
         box: Box | None = None,
         blocks: Sequence[Blocks] | None = None,
     ) -> tuple[np.ndarray, np.ndarray | None]:
-        """LPIPS [t] float32 inside a box, and weighted by the robot as `robot_lpips_frames` has it.
+        """LPIPS [t] float32 inside a box, and weighted by the robot as in `robot_lpips_frames`.
 
         Args:
-            prediction: [t h w 3] uint8.
-            target: [t h w 3] uint8, the same video in every call.
-            robot: [t h w] bool, of whole frames only; None where the second answer is not asked for.
-            box: `union_box` of the region; whole frames where left out.
-            blocks: prediction, target and, if given, robot, each in the blocks that are computed at once; frame by frame where
-                left out, which is fastest on a CPU.
+            prediction, target: [t h w 3] uint8; the target is the same video in every call.
+            robot: [t h w] bool, of whole frames; None for no second answer.
+            box: `union_box` of the region; None for whole frames.
+            blocks: the arrays in blocks that are computed at once; None for frame by frame.
         """
         arrays = (prediction, target) if robot is None else (prediction, target, robot)
         blocks = [_frame_by_frame(array) for array in arrays] if blocks is None else blocks
@@ -311,7 +306,7 @@ def _mask_box(target_mask: AnyArray) -> Box:
 
 @functools.cache
 def _weights() -> Weights:
-    """On the device, once; evaluated at once also under a jit of the caller's, so that no tracer is kept."""
+    """On the device, once; evaluated at once also under a jit of the caller's, so no tracer is kept."""
     with jax.ensure_compile_time_eval():
         return {name: jnp.asarray(array) for name, array in read_alexnet().items()}
 
@@ -411,7 +406,7 @@ def _box_features(weights: Weights, video: jax.Array, box: Box, chunk: int | Non
 
 @functools.partial(jax.jit, static_argnames="chunk")
 def _embed(weights: Weights, video: jax.Array, chunk: int | None) -> jax.Array:
-    """The features of whole frames, weighted so that squared differences add up to LPIPS: [t d]."""
+    """The features of whole frames, weighted so squared differences add up to LPIPS: [t d]."""
     vectors = []
     for i, layer in enumerate(_box_features(weights, video, _whole_box(video), chunk)):
         weighted = layer * jnp.sqrt(weights[f"head{i}"] / (layer.shape[1] * layer.shape[2])).reshape(1, 1, 1, -1)

@@ -15,7 +15,6 @@ class Total:
     total: Float32[jax.Array, ""]
     """Sum of the values that count; not finite where one of them is not."""
     count: Int32[jax.Array, ""]
-    """Number of the values that count."""
 
     @property
     def mean(self) -> Float32[jax.Array, ""]:

@@ -1,9 +1,8 @@
 """Robot kinematics and object dynamics by tracked points in the image plane.
 
-Tracks are float [t k 2] pixels (x right, y down), validity bool [t k]: the point is visible in the target. A prediction
-that lost a point holds NaN there. In the paper's definitions it is a miss for PCK and left out of the errors, so look at
-coverage with them. In the strict ones, whose names end so, it is an error like the largest that any point can have, and one
-tolerance holds for all robots.
+Tracks are float [t k 2] pixels (x right, y down); validity bool [t k] says that the target shows the point. A prediction holds
+NaN where it lost a point. By the paper's definitions a lost point is a miss for PCK and is left out of errors. By the strict
+ones, whose names say so, it has the error of failure, and one tolerance holds for all robots.
 """
 
 import functools
@@ -53,23 +52,14 @@ def pck(prediction: Tracks, target: Tracks, valid: Valid, alpha: float | jax.Arr
 @check_first(check_tracks)
 @jax.jit
 def pck_05(prediction: Tracks, target: Tracks, valid: Valid) -> Scalar:
-    """`pck` at alpha = 0.05, the second tolerance of the paper's evaluator.
-
-    Args:
-        prediction, target: [t k 2] pixels. valid: [t k] bool.
-
-    Returns:
-        Scalar float32; NaN where no point counts.
-    """
+    """`pck` of tracks [t k 2] at alpha = 0.05, the second tolerance of the paper's evaluator: scalar float32."""
     return pck(prediction, target, valid, alpha=0.05)
 
 
 @check_first(check_tracks)
 @jax.jit
 def coverage(prediction: Tracks, target: Tracks, valid: Valid) -> Scalar:
-    """Share in [0, 1] of the valid points that the prediction has, higher is better.
-
-    Belongs to every error: an error over few points that were found says little.
+    """Share in [0, 1] of the valid points that the prediction has, higher is better; reported with every error.
 
     Args:
         prediction, target: [t k 2] pixels. valid: [t k] bool.
@@ -161,15 +151,7 @@ def keypoint_error_strict(prediction: Tracks, target: Tracks, valid: Valid, side
 @check_first(check_tracks)
 @jax.jit
 def trajectory_error_strict(prediction: Tracks, target: Tracks, valid: Valid, side: float | jax.Array = SIDE) -> Scalar:
-    """`keypoint_error_strict` of points on objects: mean over frames and points, none is left out; lower is better.
-
-    Args:
-        prediction, target: [t k 2] pixels. valid: [t k] bool.
-        side: square root of the image's area [pixels].
-
-    Returns:
-        Scalar float32 from 0 to `failure_distance(side)`; NaN where no point is valid.
-    """
+    """`keypoint_error_strict` of points on objects [t k 2], mean over frames and points; scalar float32, lower is better."""
     return keypoint_error_strict(prediction, target, valid, side)
 
 
@@ -178,15 +160,15 @@ def trajectory_error_strict(prediction: Tracks, target: Tracks, valid: Valid, si
 def ndtw_strict(prediction: Tracks, target: Tracks, valid: Valid, side: float | jax.Array = SIDE) -> Scalar:
     """Dynamic time warping of each point's path over its valid frames, mean over points; lower is better, 0 is best.
 
-    Classic DTW, whose cost is that of `keypoint_error_strict`, so that a frame in which the point is lost costs most wherever
-    it is warped to; divided by the sum of both lengths and by the distance of failure. A point that is always lost has 0.5.
+    Classic DTW with the error of `keypoint_error_strict` as cost, divided by the sum of both lengths and the distance of
+    failure.
 
     Args:
         prediction, target: [t k 2] pixels. valid: [t k] bool.
         side: square root of the image's area [pixels].
 
     Returns:
-        Scalar float32 in [0, 0.5]; NaN where no point is valid.
+        Scalar float32 in [0, 0.5], 0.5 for points that are always lost; NaN where no point is valid.
     """
     return _masked_mean(*strict_warpings(prediction, target, valid, side))
 
@@ -291,10 +273,10 @@ def _path_costs(prediction: AnyArray, target: AnyArray, tracked: AnyArray, most:
 
 
 def _path_cost(prediction: AnyArray, target: AnyArray, tracked: AnyArray, most: float | jax.Array = math.inf) -> jax.Array:
-    """DTW cost of two paths [t 2] over the tracked frames; a step costs at most `most`, and so much where a place is lost.
+    """DTW cost of two paths [t 2] over the tracked frames; a step costs at most `most`, and a lost place costs `most`.
 
-    Tracked frames come first, in order, so that the cost of the paths is the cell (n - 1, n - 1) of the whole table,
-    which no later frame touches. The table is filled by anti-diagonals, whose cells do not depend on each other.
+    Tracked frames come first, so the cost is the cell (n - 1, n - 1) of the table, which no later frame touches. Cells of an
+    anti-diagonal do not depend on each other.
     """
     order = jnp.argsort(~tracked, stable=True)
     keep = tracked[order][:, None]
@@ -348,5 +330,4 @@ def _root(square: jax.Array) -> jax.Array:
 
 
 def _masked_mean(values: jax.Array, keep: AnyArray, axis: int | None = None) -> jax.Array:
-    """Mean of the values to keep; NaN where none is."""
     return jnp.sum(jnp.where(keep, values, 0), axis=axis) / jnp.sum(keep, axis=axis).astype(jnp.float32)

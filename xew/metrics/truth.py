@@ -31,7 +31,7 @@ OTHER_COLOR = 40
 """Least difference [levels of a channel] that is another color. A shadow on a bright object may be one too: then its frames
 are left out, which costs little."""
 MOVED = 0.01
-"""Distance from its first place [m] from which on an object has moved, so that points on it count."""
+"""Distance from its first place [m] from which on an object has moved, so points on it count."""
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,6 @@ def read_truth(folder: Path, frames: int, compared: Collection[str], cache: Path
 
 
 def _find_surfaces(folder: Path, frames: int, cache: Path | None) -> Surfaces | None:
-    """Points on surfaces in an episode's first frames; None where its shapes are not known."""
     # Only here: the metrics load without Warp.
     from xew.sim_warp.production.surfaces import read_surfaces
 

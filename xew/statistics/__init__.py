@@ -1,6 +1,6 @@
 """The statistics of scores: bootstrap draws, intervals, tests, noise floors and verdicts.
 
-`evaluate`, `report`, `study` and `distance` all ask here, so that the same scores have the same intervals and verdicts in each.
+`evaluate`, `report`, `study` and `distance` all ask here, so the same scores have the same intervals and verdicts in each.
 The package stands on the ground: it imports NumPy, SciPy and pandas, and nothing of ours but `xew.protocol`.
 
     bootstrap.py   what is drawn (trainings, then scenes within tasks), how often, and the mean in every draw
@@ -14,19 +14,15 @@ The package stands on the ground: it imports NumPy, SciPy and pandas, and nothin
 from xew.statistics.bootstrap import (
     DRAWS,
     MIN_SCENES,
-    UNITS,
     Mean,
-    Units,
     bootstrap_means,
     combine,
-    draw_trainings,
-    draw_units,
     every_draw,
     find_strata,
     pool_trainings,
 )
 from xew.statistics.inference import LEVEL, SIGNIFICANCE, Drawn, holm
-from xew.statistics.power import LEAST_POWER, describe_power, drop_powerless, find_power, find_powerless
+from xew.statistics.power import describe_power, find_power
 from xew.statistics.suites import describe_parting, find_parting, strict_metrics
 from xew.statistics.summary import Summary, measure_power, summarize
 from xew.statistics.verdicts import (
@@ -43,29 +39,22 @@ from xew.statistics.verdicts import (
 __all__ = [
     "BETTER",
     "DRAWS",
-    "LEAST_POWER",
     "LEVEL",
     "MIN_SCENES",
     "SIGNIFICANCE",
-    "UNITS",
     "UNRESOLVED",
     "WORSE",
     "Drawn",
     "Mean",
     "Summary",
-    "Units",
     "bootstrap_means",
     "combine",
     "describe_floors",
     "describe_parting",
     "describe_power",
-    "draw_trainings",
-    "draw_units",
-    "drop_powerless",
     "every_draw",
     "find_parting",
     "find_power",
-    "find_powerless",
     "find_strata",
     "floor_sources",
     "holm",

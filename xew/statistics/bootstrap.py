@@ -1,11 +1,11 @@
 """Bootstrap draws of scenes or tasks, and the mean of scores in every draw.
 
 The unit that is drawn is by default the scene, a (task, seed), within its task. It is drawn with all its models, robots and
-metrics together, because they share its layout: every mean of one score table sees the same draws, so that whatever is computed
+metrics together, because they share its layout: every mean of one score table sees the same draws, so whatever is computed
 of several means is paired by scene. An interval then says what other scenes of these tasks would give. Where tasks are drawn
 instead, with all their scenes, it says what other tasks would give.
 
-Of n units of a stratum (a task), n - 1 are drawn and count n / (n - 1) each, so that the variance of a mean over the draws has
+Of n units of a stratum (a task), n - 1 are drawn and count n / (n - 1) each, so the variance of a mean over the draws has
 no bias however few they are (Rao and Wu 1988, "Resampling inference with complex survey data").
 """
 
@@ -29,7 +29,6 @@ With six, all differences have one sign by chance in 3 % of cases, with five in 
 SEED = 0
 """Seed of all draws: two tables with as many scenes of each task see the same draws."""
 UNITS = {"scene": ("task", "seed"), "task": ("task",)}
-"""Columns that name a unit, by what is drawn."""
 COLUMNS_AT_ONCE = 128
 """Number of means that are drawn together, which bounds the memory."""
 
@@ -83,11 +82,9 @@ class Mean:
 
 
 def combine(function: Callable[..., np.ndarray], *means: Mean) -> Mean:
-    """A number computed of several means of one table, draw by draw; it rests on the fewest scenes and trainings of any.
+    """A number computed from several means of one table, draw by draw.
 
-    Args:
-        function: of arrays [1 + n + k] float64, one for each mean, to one such array.
-        means: of one score table, so that all see the same draws.
+    `function` maps arrays [1 + n + k] float64, one for each mean, to one such array.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         values = function(*(mean.values for mean in means))
@@ -105,7 +102,7 @@ class Units:
     """The units of a score table that are drawn, in order, each with a number from 0.
 
     Args:
-        rows: columns task and seed; the whole table, so that all of its means see the same draws.
+        rows: columns task and seed; the whole table, so all of its means see the same draws.
         kind: what is drawn, a key of UNITS.
     """
 
@@ -140,14 +137,14 @@ def find_strata(tasks: Sequence[str]) -> tuple[int, ...]:
 def bootstrap_means(
     values: np.ndarray, numbers: np.ndarray, strata: tuple[int, ...], draws: int = DRAWS
 ) -> Iterator[Mean | None]:
-    """The mean of each column of scores, with its value in every bootstrap draw; None for a column without any score.
+    """The mean of each column of scores with its value in every bootstrap draw; None for a column without scores.
 
-    A column's result does not depend, to the last bit, on the columns beside it or on the order of the rows.
+    A column's result does not depend on other columns or on the order of rows, to the last bit.
 
     Args:
         values: [n c] float, scores of n episodes; NaN where there is none.
-        numbers: [n] int, the number of each episode's unit, as `Units.numbers` gives it.
-        strata: stratum of each unit of the whole table (`Units.strata`). Units without a score in a column are drawn too.
+        numbers: [n] int, number of each episode's unit (`Units.numbers`).
+        strata: stratum of each unit of the whole table (`Units.strata`).
         draws: number of draws.
     """
     for first in range(0, values.shape[1], COLUMNS_AT_ONCE):
@@ -193,9 +190,9 @@ def _freedom(scored: np.ndarray, strata: tuple[int, ...]) -> np.ndarray:
 
 
 def _round_for_exact_sums(values: np.ndarray, terms: np.ndarray) -> np.ndarray:
-    """Round values [n c] >= 0 so that any sum of at most `terms` [c] of a column's values is exact in float64.
+    """Round values [n c] >= 0 so any sum of at most `terms` [c] of a column's values is exact in float64.
 
-    Sums are then the same in any order, so that a mean is the same alone and among others, however matrices are multiplied.
+    Sums are then the same in any order, so a mean is the same alone and among others, however matrices are multiplied.
     """
     _, exponent = np.frexp(values.max(axis=0, initial=0) * np.maximum(terms, 1))
     unit = np.ldexp(1.0, exponent - 52)
@@ -204,15 +201,11 @@ def _round_for_exact_sums(values: np.ndarray, terms: np.ndarray) -> np.ndarray:
 
 @lru_cache(maxsize=4)
 def draw_units(strata: tuple[int, ...], draws: int = DRAWS) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], ...]:
-    """How often each unit is drawn within its stratum: once each in the first row, then at random with replacement.
-
-    Args:
-        strata: stratum of each unit.
-        draws: number of draws.
+    """Number of times that each unit is drawn within its stratum: once in the first row, then at random with replacement.
 
     Returns:
-        For each size n of strata: the numbers of their units [m] int; what a drawn unit counts [1 + draws 1] float64, 1 and
-        then n / (n - 1); and how often it is drawn [1 + draws m] float64, n - 1 times in a stratum.
+        For each size n of strata: numbers of their units [m] int; weight of a drawn unit [1 + draws 1] float64, 1 and then n /
+            (n - 1); and number of draws of it [1 + draws m] float64, n - 1 in total for each stratum.
     """
     rng, codes = np.random.default_rng(SEED), np.asarray(strata)
     sizes = np.bincount(codes)
@@ -246,14 +239,10 @@ def draw_trainings(variant: str, count: int, draws: int = DRAWS) -> np.ndarray:
 
 
 def pool_trainings(means: Sequence[Mean], variant: str, left_out: Sequence[tuple[str, int]] = ()) -> Mean:
-    """The mean of a variant over its trainings, each as heavy as another.
+    """The mean of a variant over its training runs, equally weighted.
 
-    Trainings are drawn first, then scenes, the same scenes for all trainings (Owen 2007, "The pigeonhole bootstrap").
-
-    Args:
-        means: of each training, over the same episodes.
-        variant: name of the variant.
-        left_out: names of all variants of the table that have several trainings, and how many.
+    Training runs are drawn first, then scenes, the same for all runs (Owen 2007, "The pigeonhole bootstrap"). `left_out` has
+    the names of all variants with several runs, and their numbers.
     """
     values, count = np.stack([mean.values for mean in means], axis=1), len(means)
     weights = draw_trainings(variant, count, len(values) - 1) if count > 1 else np.ones((1, 1))
@@ -270,10 +259,5 @@ def pool_trainings(means: Sequence[Mean], variant: str, left_out: Sequence[tuple
 
 
 def every_draw(count: int, least: int) -> np.ndarray:
-    """[n count] int, all draws with replacement of so few units that none need be left to chance.
-
-    Args:
-        count: number of units.
-        least: least number of different units in a draw.
-    """
+    """[n count] int, all draws with replacement of `count` units, with at least `least` different units."""
     return np.array([drawn for drawn in product(range(count), repeat=count) if len(set(drawn)) >= least])

@@ -2,7 +2,7 @@
 
 An interval and a p-value are two readings of the same draws. The share of draws beyond a bound is taken for the tail of a
 Student's t with the degrees of freedom that the number has, and not of a normal distribution (the expanded percentile interval
-of Hesterberg 2015, "What teachers should know about the bootstrap"), so that intervals of few scenes are as wide as they have
+of Hesterberg 2015, "What teachers should know about the bootstrap"), so intervals of few scenes are as wide as they have
 to be. Beyond the outermost draws the tail is continued in proportion to the distance from their median.
 
 Where trainings are drawn too, the degrees of freedom are those of Satterthwaite (1946, "An approximate distribution of
@@ -40,7 +40,6 @@ class Drawn:
         self.freedom = self._pool_freedom(freedom, values[end:], left_out)
 
     def _pool_freedom(self, freedom: float, without: np.ndarray, left_out: Sequence[int]) -> float:
-        """Degrees of freedom of trainings and scenes together."""
         if not left_out or not len(self._drawn):
             return freedom
         counts = np.asarray(left_out)
@@ -98,7 +97,6 @@ class Drawn:
         return middle + (end - middle) * z / float(ndtri(edge))
 
     def _quantile(self, share: float) -> float:
-        """Quantile by linear interpolation, as NumPy's."""
         place = share * (len(self._drawn) - 1)
         below = int(place)
         above = min(below + 1, len(self._drawn) - 1)

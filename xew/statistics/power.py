@@ -17,15 +17,11 @@ LEAST_POWER = 2.0
 
 
 def find_power(rows: pd.DataFrame, bests: Mapping[str, float]) -> pd.DataFrame:
-    """The power of each task for each metric, over the episodes of all robots.
-
-    Args:
-        rows: of a score table; columns model, task, metric, value.
-        bests: best values of the metrics that are asked for.
+    """The power of each task for each metric with a best value, over the episodes of all robots.
 
     Returns:
-        task, metric, frozen and truth (mean scores of the frozen first frame and of the true video), power (the first's
-        distance from the best over the second's), kept (whether that is above LEAST_POWER). No row where one was not graded.
+        task, metric, frozen and truth (mean scores), power (the frozen first frame's distance from the best over the true
+            video's), kept (whether power reaches LEAST_POWER). No row where one was not graded.
     """
     baselines = rows[rows["model"].isin([COPY_FIRST_FRAME, GROUND_TRUTH]) & rows["metric"].isin(list(bests))]
     means = baselines.groupby(["task", "metric", "model"])["value"].mean().unstack()
@@ -51,19 +47,14 @@ def drop_powerless(rows: pd.DataFrame, power: pd.DataFrame) -> pd.DataFrame:
 
 
 def describe_power(power: pd.DataFrame, titles: Mapping[str, str]) -> str:
-    """Sentence that says which tasks leave which means; '' where none does.
-
-    Args:
-        power: as of `find_power`.
-        titles: of metrics by name.
-    """
+    """Sentence on the tasks that means leave out, with titles of metrics by name; '' if there is none."""
     tasks: dict[str, list[str]] = {}
     for task, metric in find_powerless(power):
         tasks.setdefault(titles.get(metric, metric), []).append(task)
     if not tasks:
         return ""
-    found = "; ".join(f"{metric}: {', '.join(names)}" for metric, names in tasks.items())
+    left_out = "; ".join(f"{metric}: {', '.join(names)}" for metric, names in tasks.items())
     return (
-        f"Tasks without power, in which the frozen first frame is less than {LEAST_POWER:g} times as far from the best as the "
-        f"true video, leave the mean of {found}."
+        f"Means leave out tasks without power, where the frozen first frame is less than {LEAST_POWER:g} times as far from the "
+        f"best score as the true video ({left_out})."
     )

@@ -23,12 +23,7 @@ def strict_metrics(metrics: Mapping[str, Suited]) -> dict[str, str]:
 
 
 def find_parting(verdicts: Mapping[str, str], metrics: Mapping[str, Suited]) -> list[tuple[str, str]]:
-    """Names of the strict metric and of its counterpart where their verdicts differ.
-
-    Args:
-        verdicts: on one comparison, by metric.
-        metrics: all of the table.
-    """
+    """Names of the strict metric and of its counterpart where their verdicts on one comparison differ."""
     pairs = ((strict, paper) for paper, strict in strict_metrics(metrics).items())
     return [pair for pair in pairs if set(pair) <= verdicts.keys() and verdicts[pair[0]] != verdicts[pair[1]]]
 

@@ -19,7 +19,6 @@ from xew.statistics.suites import Suited, strict_metrics
 from xew.statistics.verdicts import describe_floors, floor_sources, largest_floor, noise_floor, verdict
 
 Column = tuple[str, str, str]
-"""Metric, model and condition."""
 Codecs = Mapping[str, Sequence[str]]
 """Conditions of the truth through the codecs of each model."""
 EPISODE = ["task", "seed", "robot"]
@@ -69,7 +68,6 @@ class Summary:
     unit: str
     """Unit that was resampled, a key of UNITS."""
     floors: str
-    """Sentence that says which baseline the noise floors come from."""
     power: pd.DataFrame
     """Power of each task for each metric (`find_power`); tasks without it are in no mean and no difference."""
 
@@ -89,13 +87,13 @@ def summarize(
     """Summarize a score table.
 
     Args:
-        rows: model condition task seed robot metric value; all of the table, so that every mean has the same draws.
-        metrics: of the table, by name; means are in this order.
+        rows: model condition task seed robot metric value; the whole table, so all means share their draws.
+        metrics: by name, in the order of the means.
         groups: robots that are pooled, by the name of the group.
-        codecs: by model, conditions of the truth through its codec, for the noise floor (`floor_sources`).
-        unit: what is resampled, a key of UNITS.
+        codecs: conditions of the truth through each model's codec (`floor_sources`).
+        unit: unit to resample, a key of UNITS.
     """
-    power, units, beside = measure_power(rows, metrics), Units(rows, unit), strict_metrics(metrics)
+    power, units, replaced = measure_power(rows, metrics), Units(rows, unit), strict_metrics(metrics)
     models = [model for model in rows["model"].unique() if model not in BASELINES]
     rows = drop_powerless(rows, power)
     means: list[tuple[Any, ...]] = []
@@ -103,12 +101,14 @@ def summarize(
     for group, robots in groups.items():
         table = _pivot(rows[rows["robot"].isin(robots)], list(metrics))
         columns = _columns(table)
-        found = dict(zip(columns, _bootstrap(table.to_numpy(), table, units), strict=True))
-        floors = {column: _find_floor(column, found, codecs, metrics[column[0]]) for column in columns}
+        bootstrapped = dict(zip(columns, _bootstrap(table.to_numpy(), table, units), strict=True))
+        floors = {column: _find_floor(column, bootstrapped, codecs, metrics[column[0]]) for column in columns}
         compared = _compare_pairs(table, floors, units, metrics)
         verdicts = {pair[:3]: pair[-1] for pair in compared if pair[3] == GROUND_TRUTH}
-        means += [(group, *_mean_row(column, found, metrics), floors[column], verdicts.get(column, "")) for column in columns]
-        pairs += [(group, *pair, pair[0] not in beside) for pair in compared]
+        means += [
+            (group, *_mean_row(column, bootstrapped, metrics), floors[column], verdicts.get(column, "")) for column in columns
+        ]
+        pairs += [(group, *pair, pair[0] not in replaced) for pair in compared]
     return Summary(
         pd.DataFrame(means, columns=MEANS), pd.DataFrame(pairs, columns=PAIRS), unit, describe_floors(models, codecs), power
     )
@@ -145,7 +145,6 @@ def _find_floor(column: Column, means: Mapping[Column, Mean], codecs: Codecs, in
 
 
 def _mean_row(column: Column, means: Mapping[Column, Mean], metrics: Mapping[str, Summarized]) -> tuple[Any, ...]:
-    """The cells of MEANS from dimension to truth."""
     metric, model, condition = column
     info, mean, truth = metrics[metric], means[column], means.get((metric, GROUND_TRUTH, ""))
     numbers = (mean.value, *mean.interval(), mean.count, truth.value if truth else math.nan)

@@ -10,7 +10,7 @@ import pytest
 from tests.analysis.test_report import Page
 from xew.analysis.paper import read_paper
 from xew.analysis.report import Args, main
-from xew.analysis.tables.distances import format_signed
+from xew.analysis.tables.table import format_signed
 
 
 @pytest.fixture(scope="module")

@@ -106,15 +106,17 @@ def test_progress_is_the_share_of_the_way_from_frozen_to_true() -> None:
 def test_the_finding_says_better_worse_and_how_far() -> None:
     said = finding([table("Panda", 0.1), table("Piper", 0.5)], [table("Seen", 0.2)], [info("lpips")])
     assert said == [
-        "Panda (4 episodes): m · c beats a frozen first frame on LPIPS. "
-        "In LPIPS it is at 25% of that frame's distance from the truth (on seen robots 50%).",
-        "Piper (4 episodes): m · c falls behind a frozen first frame on LPIPS. "
-        "In LPIPS it is at 125% of that frame's distance from the truth (on seen robots 50%).",
+        "Panda (4 episodes): m · c is better than the frozen first frame on LPIPS. "
+        "Its LPIPS error is 25\u00a0% of the frozen first frame's (50\u00a0% on seen robots).",
+        "Piper (4 episodes): m · c is worse than the frozen first frame on LPIPS. "
+        "Its LPIPS error is 125\u00a0% of the frozen first frame's (50\u00a0% on seen robots).",
     ]
     assert "--no-baselines" in finding([], [], [info("lpips")])[0]
     few = Row("m", "c", {"lpips": Interval(0.1, np.nan, np.nan, 4)}, {"lpips": "unresolved"})
     said = finding([RobotTable("Panda", ("Panda",), (few,), 4)], [], [info("lpips")])
-    assert said == ["Panda (4 episodes): m · c cannot be told from a frozen first frame by fewer than 6 scenes."]
+    assert said == [
+        "Panda (4 episodes): m · c cannot be compared with the frozen first frame: fewer than 6 scenes were graded."
+    ]
 
 
 def test_numbers_have_the_digits_that_mean_something() -> None:

@@ -192,10 +192,10 @@ def test_a_subset_keeps_what_it_starts_from(study: Study) -> None:
     [
         (["--parts", "ladders"], "did you mean 'ladder'"),
         (["--robots", "pipr"], "did you mean 'piper'"),
-        (["--robots", "piper", "piper"], "a robot stands twice in piper, piper"),
+        (["--robots", "piper", "piper"], "a robot is named twice in piper, piper"),
         (["--tasks", "lift_pott"], "did you mean 'lift_pot'"),
-        (["--tasks", "lift_pot", "lift_pot"], "a task stands twice"),
-        (["--training-seeds", "1", "1"], "a training seed stands twice in 1, 1"),
+        (["--tasks", "lift_pot", "lift_pot"], "a task is named twice"),
+        (["--training-seeds", "1", "1"], "a training seed is named twice in 1, 1"),
         (["--shots", "1", "5"], "unknown number of shots '5'; known: 1, 2, 3"),
         (["--variants", "loeo_*", "leo_*"], "variants 'leo_\\*' matches none of the parts"),
         (["--variants", "few_shot-piper-3"], "no variant"),

@@ -160,7 +160,7 @@ def test_the_command_writes_a_page(
     (film,) = content["films"]
     assert film["rows"] == ["video", "prediction", "difference"] and film["tile"] == [320, 240] and film["label"] == "m"
     assert len(film["psnr"][1]) == 4 and film["psnr"][0] is None, "only one robot is predicted, and shorter"
-    assert [robot["title"] for robot in content["robots"]] == ["UR5 with WSG-50", "Piper"]
+    assert [robot["title"] for robot in content["robots"]] == ["UR5", "Piper"]
     frames = read_video(tmp_path / "page" / f"{stem}_0.mp4")
     assert frames.shape == (FRAMES, 720, 640, 3) and np.abs(frames[:, :240, 320:].astype(int) - truth).mean() < 4
 

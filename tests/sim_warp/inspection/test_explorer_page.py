@@ -116,7 +116,7 @@ def test_keys_and_buttons_step_to_the_very_frame_of_all_robots(tab: Tab, data: P
     for key, frame in (("Shift+ArrowRight", 10), ("ArrowRight", 11), ("ArrowRight", 12), ("ArrowLeft", 11)):
         tab.keyboard.press(key)
         at_frame(tab, frame)
-    for title, robot in (("UR5 with WSG-50", "ur5_wsg"), ("Piper", "piper")):
+    for title, robot in (("UR5", "ur5_wsg"), ("Piper", "piper")):
         video = read_video(episode_folder(data, TASK, 0, robot) / "rgb.mkv")
         assert np.abs(video[11].astype(int) - video[10]).mean() > 0.2, "frames differ"
         assert nearest(picture(tab, f"Video of {title}"), video) == 11

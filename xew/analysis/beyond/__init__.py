@@ -1,9 +1,7 @@
-"""What five robots in one motion cannot answer: tables beyond the paper.
+"""Tables beyond the paper, on questions that five robots in one motion cannot answer.
 
-`scaling.py` compares models by the number of bodies that they were trained on, `difficulty.py` correlates the error of one
-model on many bodies with how far these are from the robots that it was trained on, `halves.py` does so with the gap of bodies
-that one model trained on and another did not, and `motion.py` sets a study in shared motion beside the same study in motion of
-each robot's own. `reports/study_beyond.py` draws them.
+`scaling.py`: scores by the number of bodies in training. `difficulty.py`: error of one model on many bodies against their
+distance. `halves.py`: gap between models that saw a body and that did not. `motion.py`: shared against own motion.
 """
 
 from xew.analysis.beyond.difficulty import OverBodies, body_errors, correlate_bodies, difficulty_table, find_difficulty

@@ -1,8 +1,7 @@
-"""Error of one model on many bodies that it has never seen, against how far these are from the robots that it was trained on.
+"""Error of one model on many bodies that it has never seen, against their distance from the robots in training.
 
-Five robots give a correlation of five points; here each body is a point. All bodies are graded on the same scenes. How hard a
-body's pictures are by themselves shows in the frozen first frame, which learned nothing: its correlation stands beside the
-model's, and the partial correlation says what is left of the model's once that is taken out.
+Each body is a point, graded on the same scenes. The frozen first frame, a no-learning baseline, shows the difficulty of a
+body's pictures; the partial correlation removes it.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,16 +14,15 @@ from scipy.stats import BootstrapMethod, PermutationMethod, pearsonr
 from xew.analysis.paper import AXES, PAPER_TITLES
 from xew.analysis.scores import COPY, MetricInfo
 from xew.analysis.statistics.grades import StudyGrades
-from xew.analysis.tables.distances import AXIS_TITLES, Distances, format_signed
+from xew.analysis.tables.distances import AXIS_TITLES, Distances
 from xew.analysis.tables.labels import PAPER_METRICS
-from xew.analysis.tables.table import Column, Table, TableCell, TableRow, TableSection
+from xew.analysis.tables.table import Column, Table, TableCell, TableRow, TableSection, format_signed
 from xew.protocol import DISTANCE_BODIES, PARTS, SPLITS
 from xew.statistics import DRAWS, LEVEL, holm
 
 VARIANT = PARTS["bodies"][0]
 """The model whose errors are correlated."""
 LEAST_BODIES = 8
-"""Smallest number of bodies that are correlated."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +33,6 @@ class BodyCorrelation:
     low: float
     """Lower end of its 95 % interval over bodies (bootstrap, BCa)."""
     high: float
-    """Upper end."""
     p_value: float
     """Two-sided, by permutation of the bodies; of the paper's two kinds of distance corrected by Holm for both."""
     frozen: float
@@ -43,7 +40,6 @@ class BodyCorrelation:
     partial: float
     """Partial correlation of distance with error, given the error of the frozen first frame; NaN where that is not known."""
     bodies: int
-    """Number of bodies."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +53,7 @@ class OverBodies:
 
 
 def find_difficulty(grades: StudyGrades, distances: Distances) -> dict[str, OverBodies]:
-    """How each reported metric goes with distance over bodies, by the metric's key."""
+    """Correlation of each reported metric with distance over bodies, by the metric's key."""
     found = {}
     for name, metric in grades.metrics.items():
         if name in PAPER_METRICS or metric.reported:
@@ -67,16 +63,10 @@ def find_difficulty(grades: StudyGrades, distances: Distances) -> dict[str, Over
 
 
 def body_errors(grades: StudyGrades, distances: Distances, metric: str) -> pd.DataFrame:
-    """Errors of the model on each body of the wide family, with its distances; bodies that lack either are left out.
+    """Mean error of the model on each body of the wide family (`value`), of the frozen first frame (`frozen`), and
+    distances.
 
-    Args:
-        grades: of the study.
-        distances: that were measured with these bodies.
-        metric: its key.
-
-    Returns:
-        Table by body with the columns value (mean over its episodes, in the metric's unit), frozen (that of the frozen first
-        frame) and one for each kind of distance: the mean over the robots that the model was trained on.
+    Distances are means over the training robots, one column for each kind. Bodies without a score or a distance are left out.
     """
     by_axis = mean_distances(distances, DISTANCE_BODIES, SPLITS[VARIANT.split].train_robots)
     rows = {}
@@ -97,11 +87,10 @@ def mean_distances(distances: Distances, bodies: Sequence[str], trained: Sequenc
 
 
 def correlate_bodies(errors: pd.DataFrame, higher_is_better: bool) -> dict[str, BodyCorrelation]:
-    """Correlations of errors with distances by kind of distance; none of fewer than LEAST_BODIES bodies or of equal errors.
+    """Correlations of errors with distances, by kind of distance; none for fewer than LEAST_BODIES bodies or constant
+    errors.
 
-    Args:
-        errors: table of `body_errors`.
-        higher_is_better: of the metric; its sign is turned, so that a positive r always means that farther is worse.
+    A positive r always means that a farther body is worse.
     """
     sign = -1.0 if higher_is_better else 1.0
     score, frozen = (sign * errors[name].to_numpy(np.float64) for name in ("value", "frozen"))
@@ -128,12 +117,7 @@ def _correlate(distance: np.ndarray, score: np.ndarray, frozen: np.ndarray) -> B
 
 
 def difficulty_table(found: Mapping[str, OverBodies], metrics: Mapping[str, MetricInfo]) -> Table | None:
-    """Correlation of each metric with each kind of distance over bodies; None where bodies are too few.
-
-    Args:
-        found: of `find_difficulty`.
-        metrics: of the study, by key.
-    """
+    """Correlation of each metric with each kind of distance over bodies; None if there are too few bodies."""
     return bodies_table(
         found,
         metrics,
@@ -147,12 +131,9 @@ def difficulty_table(found: Mapping[str, OverBodies], metrics: Mapping[str, Metr
 def bodies_table(
     found: Mapping[str, OverBodies], metrics: Mapping[str, MetricInfo], name: str, title: str, caption: str
 ) -> Table | None:
-    """Table of the correlations of each metric, by key, with each kind of distance; None where bodies are too few.
+    """Table of the correlations of each metric with each kind of distance; None if there are too few bodies.
 
-    Args:
-        found: numbers that each metric gives of bodies, and their correlations.
-        metrics: of the study, by key.
-        name, title, caption: of the table. The title has the number of bodies in place of {}, the caption says what r is of.
+    `{}` in the title is the number of bodies; the caption says what r correlates.
     """
     axes = [axis for axis in AXIS_TITLES if any(axis in one.correlations for one in found.values())]
     if not axes:
@@ -168,7 +149,7 @@ def bodies_table(
         title.format(count),
         f"{caption} p is by permutation, corrected by Holm for the paper's two kinds of distance; LPIPS by these is the "
         "primary outcome, all else exploratory. Frozen: r of the same distance with the score of the frozen first frame, which "
-        "learned nothing. Partial: what is left of r given the frozen frame's score.",
+        "learned nothing. Partial: r given the frozen frame's score.",
         ("metric",),
         tuple(Column(head, AXIS_TITLES[axis]) for axis in axes for head in heads),
         (TableSection("", tuple(rows)),),

@@ -1,7 +1,6 @@
-"""The gap of many bodies: each is rendered by a model that trained on it and by one that did not.
+"""The gap of many bodies between a model that trained on the body and one that did not.
 
-The folds of the paper give a gap for each of five robots. Here two models share out the bodies: each trains on one half and is
-graded on both. What makes a body hard for whoever renders it cancels; what is left is the price of never having seen it.
+Two models each train on one half of the bodies and are graded on both, so a body's own difficulty cancels.
 """
 
 from collections.abc import Mapping
@@ -21,7 +20,7 @@ PART = "halves"
 
 
 def find_gaps(grades: StudyGrades, distances: Distances) -> dict[str, OverBodies]:
-    """The gap of each body in each reported metric, and how it goes with distance, by the metric's key."""
+    """The gap of each body in each reported metric and its correlation with distance, by the metric's key."""
     found = {}
     for name, metric in grades.metrics.items():
         if name in PAPER_METRICS or metric.reported:
@@ -31,21 +30,14 @@ def find_gaps(grades: StudyGrades, distances: Distances) -> dict[str, OverBodies
 
 
 def body_gaps(grades: StudyGrades, distances: Distances, metric: str) -> pd.DataFrame:
-    """By how much each body is rendered worse by the model that never saw it.
+    """Relative loss of the model that never saw a body against the model that did, on the same episodes.
 
-    The two models are trainings of their own, one of which may be better on all bodies: that raises the gaps of one half and
-    lowers those of the other. It is taken out by giving both halves the same mean.
-
-    Args:
-        grades: of the study.
-        distances: that were measured with these bodies.
-        metric: its key.
+    One of the two models may be better on all bodies, which raises the gaps of one half and lowers the other's. Giving both
+    halves the same mean removes this effect.
 
     Returns:
-        Table by body with the columns value (gap over the episodes that both models have, in percent of the score of the model
-        that saw it; positive is worse whatever the metric), frozen (error of the frozen first frame, turned so that more is
-        worse) and one for each kind of distance: the mean over the bodies of the training that did not have it. Bodies that
-        lack a score or a distance are left out.
+        Table by body: value (gap in percent, positive is worse), frozen (error of the frozen first frame), and mean distances
+            to the bodies in training.
     """
     info = grades.metrics[metric]
     found = []
@@ -66,20 +58,14 @@ def body_gaps(grades: StudyGrades, distances: Distances, metric: str) -> pd.Data
 
 
 def gaps_table(found: Mapping[str, OverBodies], metrics: Mapping[str, MetricInfo]) -> Table | None:
-    """Correlation of the gap in each metric with each kind of distance; None where bodies are too few.
-
-    Args:
-        found: of `find_gaps`.
-        metrics: of the study, by key.
-    """
+    """Correlation of the gap in each metric with each kind of distance; None if there are too few bodies."""
     return bodies_table(
         found,
         metrics,
         PART,
         "The gap of {} bodies against their distance",
-        "By how much a body is rendered worse by a model that never saw it than by one that did, on the same episodes, in "
-        "percent of the latter's score; what makes a body hard for both cancels. That one of the two models may be better on "
-        "all bodies is taken out: both halves have the same mean gap. Pearson's r of this gap with the body's mean distance to "
-        "the bodies that the first model was trained on, with its 95 % interval over bodies. Positive: what is farther has a "
-        "larger gap.",
+        "Gap: loss of a model that never saw the body against one that did, on the same episodes, in percent of the latter's "
+        "score. Both halves have the same mean gap, which removes a general difference of the two models. Pearson's r of the "
+        "gap with the body's mean distance to the first model's training bodies, with its 95 % interval over bodies. Positive: "
+        "farther bodies have a larger gap.",
     )

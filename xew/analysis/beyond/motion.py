@@ -1,8 +1,4 @@
-"""Scores of two studies that differ in the kind of motion alone: all robots on one tool path, and each in motion of its own.
-
-In shared motion an unseen robot is new in its body alone. What an action representation loses in own motion is what it owed to
-tool paths that it knew.
-"""
+"""Scores of two studies that differ only in the kind of motion: shared tool paths, or each robot's own motion."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -20,21 +16,16 @@ from xew.protocol import BASELINES, COPY_FIRST_FRAME, MOTIONS, OWN_MOTION, PASTE
 from xew.statistics import LEVEL, Mean, combine, noise_floor, strict_metrics, verdict
 
 METRICS = ("lpips", "mask_iou", "pck")
-"""Metrics of the table, one of each dimension that it can tell apart; a metric of the suite strict stands for the paper's."""
+"""Metrics of the table; a strict metric replaces the paper's."""
 UNLEARNED = {name: BASELINES[name] for name in (COPY_FIRST_FRAME, PASTED_RENDER)}
-"""Titles of what no model made, by name: how hard the episodes of each kind of motion are by themselves."""
+"""Titles of the no-learning baselines, which show the difficulty of each kind of motion."""
 CELL = ["task", "seed", "robot"]
 
 
 class Motions:
-    """Both studies as one table, over the episodes that both have, so that differences are paired by scene.
+    """Both studies as one table over their common episodes, so differences are paired by scene.
 
-    Args:
-        scores: of a study in one kind of motion.
-        other: of the same study in the other kind.
-
-    Raises:
-        ConfigError: both are of the same kind, or of other graders.
+    Raises ConfigError if both have the same kind of motion or were graded by different protocols.
     """
 
     def __init__(self, scores: Scores, other: Scores) -> None:
@@ -44,7 +35,7 @@ class Motions:
                 f"scores of {scores.motion} and of {other.motion} motion are compared; expected one table of each kind."
             )
         if (one := scores.attributes["protocol"]) != (two := other.attributes["protocol"]):
-            raise ConfigError(f"the tables of both motions were graded by protocols {one} and {two}; grade one of them anew.")
+            raise ConfigError(f"the tables of both motions were graded by protocols {one} and {two}; grade one of them again.")
         shared = found[SHARED_MOTION].rows[CELL].drop_duplicates().merge(found[OWN_MOTION].rows[CELL].drop_duplicates())
         rows = [_name_motion(table.rows, motion).merge(shared, on=CELL) for motion, table in found.items()]
         infos = {metric.name: metric for metric in scores.metrics}
@@ -53,24 +44,20 @@ class Motions:
         self._grades = StudyGrades(pd.concat(rows, ignore_index=True), tuple(self.metrics.values()), axes)
 
     def mean(self, motion: str, row: str, robots: str, metric: str) -> Mean | None:
-        """The mean score on some robots in a kind of motion; None where it was not graded.
+        """Mean score on the robots of a key of GROUP_TITLES in one of MOTIONS; None if it was not graded.
 
-        Args:
-            motion: one of MOTIONS.
-            row: an action representation, for its model, or a name of UNLEARNED.
-            robots: key of GROUP_TITLES.
-            metric: its name.
+        `row` is an action representation, or a key of UNLEARNED.
         """
         name = row if row in UNLEARNED else reference(action=row).name
         return self._grades.variant_mean(_named(name, motion), pooled(reference(), robots), metric)
 
     def change(self, action: str, robots: str, metric: str) -> Mean | None:
-        """Share of its score in shared motion by which a representation's model differs in own motion; None as `mean`."""
+        """Relative change of an action representation's score from shared to own motion; None if one was not graded."""
         shared, own = (self.mean(motion, action, robots, metric) for motion in (SHARED_MOTION, OWN_MOTION))
         return combine(lambda after, before: after / before - 1, own, shared) if own and shared else None
 
     def floor(self, robots: str, metric: str) -> float:
-        """The larger of both noise floors, by the truth through codecs where it was graded; NaN where one is not known."""
+        """The larger of both noise floors; NaN if one is not known."""
         info, names = self.metrics[metric], self._grades.codec_truths or [_named(TRUTH, motion) for motion in MOTIONS]
         truths = [self._grades.variant_mean(name, pooled(reference(), robots), metric) for name in names]
         return float(np.max([noise_floor(mean.value if mean else None, info.best, info.estimated) for mean in truths]))
@@ -89,9 +76,9 @@ def motion_table(motions: Motions) -> Table:
     return Table(
         "motion",
         "Action representation in shared and in own motion",
-        "Shared: all robots follow one tool path, so that the body alone is new. Own: each robot moves as its own planner "
-        "would have it. Both have models of their own, graded on the same scenes; the last two rows learned nothing. "
-        "Marks: own against shared.",
+        "Shared: all robots follow one tool path, so only the body is new. Own: each robot moves by its own planner. Each kind "
+        "has its own models, graded on the same scenes; the last two rows are no-learning baselines. Marks: own compared with "
+        "shared.",
         ("action representation",),
         tuple(Column(motion, metric_title(motions.metrics[metric])) for metric in shown for motion in MOTIONS),
         tuple(sections),
@@ -99,11 +86,7 @@ def motion_table(motions: Motions) -> Table:
 
 
 def motion_frame(motions: Motions, metric: str) -> pd.DataFrame:
-    """Means of a metric with the ends of their intervals, NaN where one was not graded.
-
-    Returns:
-        Table with the columns robots (a key of GROUP_TITLES), action, motion (one of MOTIONS), value, low, high.
-    """
+    """Means of a metric: table robots (key of GROUP_TITLES), action, motion, value, low, high; NaN if not graded."""
     rows = []
     for robots in GROUP_TITLES:
         for action in ACTIONS:
@@ -114,7 +97,6 @@ def motion_frame(motions: Motions, metric: str) -> pd.DataFrame:
 
 
 def _cells(motions: Motions, row: str, robots: str, metric: str) -> Sequence[TableCell]:
-    """The scores in shared and in own motion, the latter with the verdict on their difference."""
     info = motions.metrics[metric]
     means = [motions.mean(motion, row, robots, metric) for motion in (SHARED_MOTION, OWN_MOTION)]
     shared, own = (mean_cell(mean, info, LEVEL) if mean else TableCell() for mean in means)

@@ -15,7 +15,7 @@ BASE = "scaling_seen"
 """Row that all others are compared with: the three robots alone."""
 WITH_ROBOTS, ALONE = "three robots and bodies", "bodies alone"
 PASTED = BASELINES[PASTED_RENDER]
-"""Name of what learned nothing and is set beside the models."""
+"""Name of the no-learning baseline."""
 ROWS = {
     BASE: (WITH_ROBOTS, 0),
     **{f"scaling_seen_bodies_{count}": (WITH_ROBOTS, count) for count in BODY_SCALES},
@@ -23,7 +23,6 @@ ROWS = {
 }
 """Rows of the part, with what a model was trained on and the number of bodies (K)."""
 GROUPS = {**HELD_OUT_TITLES, BODIES: "Bodies that no model has seen"}
-"""Titles of the robots that are graded."""
 
 
 def scaling_table(builder: Builder) -> Table:
@@ -40,7 +39,7 @@ def scaling_table(builder: Builder) -> Table:
         "scaling",
         "Bodies in training, robots never seen",
         "K is the number of procedural bodies that a model was trained on; all models have the same number of steps. Marks: "
-        "against the three robots alone.",
+        "compared with the three robots alone.",
         ("trained on",),
         metric_columns(builder.ours.metrics, metrics),
         tuple(section(robots, title) for robots, title in GROUPS.items()),
@@ -48,12 +47,9 @@ def scaling_table(builder: Builder) -> Table:
 
 
 def scaling_frame(builder: Builder, metric: str) -> pd.DataFrame:
-    """Means of a metric with the ends of their intervals, over the episodes that all models have.
+    """Means of a metric over the episodes that all models have; rows that were not graded on them are left out.
 
-    Returns:
-        Table with the columns robots (a key of GROUPS), trained_on (WITH_ROBOTS, ALONE, or PASTED, which learned nothing),
-        bodies (K; NaN of the last), value, low, high; rows that were not run are left out, and PASTED where it was graded on
-        fewer episodes than the models.
+    Columns: robots (key of GROUPS), trained_on (WITH_ROBOTS, ALONE or PASTED), bodies (K; NaN of PASTED), value, low, high.
     """
     rows: list[tuple[str, str, float, float, float, float]] = []
     for robots in GROUPS:
@@ -63,7 +59,7 @@ def scaling_frame(builder: Builder, metric: str) -> pd.DataFrame:
             if mean is not None:
                 rows.append((robots, kind, count, mean.value, *interval_ends(mean, builder.ours.level)))
                 most = max(most, mean.count)
-        pasted = builder.baseline(PASTED_RENDER, pooled(find_variant(PART, BASE), robots), metric)
+        pasted = builder.variant_cell(PASTED_RENDER, pooled(find_variant(PART, BASE), robots), metric)
         if pasted.value is not None and pasted.episodes >= most:
             rows.append((robots, PASTED, math.nan, pasted.value, pasted.low, pasted.high))
     return pd.DataFrame(rows, columns=["robots", "trained_on", "bodies", "value", "low", "high"])

@@ -9,7 +9,6 @@ from scipy.spatial.distance import pdist, squareform
 from xew.analysis.distances.matrices import symmetric_matrix
 
 HUE_BINS = SATURATION_BINS = 16
-"""Numbers of bins of the histogram."""
 WHITE = 250
 """Level from which on, in all channels, a pixel of a robot-only render is background."""
 
@@ -18,11 +17,11 @@ ImageEmbedding = Callable[[np.ndarray], np.ndarray]
 
 
 def appearance_descriptor(renders: np.ndarray) -> np.ndarray:
-    """Describe what a robot looks like by one vector, the mean over its views.
+    """Vector that describes a robot's appearance, the mean over its views.
 
-    Each view gives a 16 x 16 histogram of hue and saturation over the robot's pixels (sum 1) and the logarithms of the
-    seven Hu moments of its silhouette, which keep the moments' signs, as is customary. The last three moments are tiny and
-    of either sign, so their logarithms jump between large positive and negative numbers and outweigh all else, colors too.
+    Each view gives a 16 x 16 histogram of hue and saturation over the robot's pixels (sum 1) and the signed logarithms of the
+    seven Hu moments of its silhouette. The last three moments are tiny and of either sign, so their logarithms outweigh all
+    other numbers.
 
     Args:
         renders: [v h w 3] uint8 RGB, the robot alone on white; the paper uses nine standard views.

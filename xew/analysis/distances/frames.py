@@ -1,4 +1,4 @@
-"""Tables of measured distances: tidy frames with the paper's figures beside, and the same as text."""
+"""Tables of measured distances: tidy frames with the paper's values, and text."""
 
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
@@ -21,7 +21,6 @@ class Axis:
     """One kind of distance between robots."""
 
     robots: tuple[str, ...]
-    """Names of the robots, in the order of the matrices."""
     value: np.ndarray
     """[n n] distances."""
     draws: np.ndarray
@@ -91,7 +90,6 @@ def _standard_deviation(draws: np.ndarray) -> np.ndarray:
 
 
 def _published_pair(paper: Paper, axis: str, robot: str, other: str) -> float:
-    """The distance that the paper prints for two robots; NaN where it prints none."""
     names = list(paper.robots)
     if axis not in paper.distances or robot not in names or other not in names:
         return np.nan

@@ -15,7 +15,6 @@ from xew.sim_warp.robots import RobotSpec, Urdf, UrdfError, load_urdf
 CONFIGURATIONS = 1500
 """Number of joint configurations that one draw samples, the paper's (its appendix on embodiment distances)."""
 CLOUD_POINTS = 4000
-"""Number of points that a cloud keeps, the paper's."""
 
 ANOTHER_DRAW = 1_000_000
 """Offset between the seeds of two draws of one robot."""
@@ -27,7 +26,7 @@ paper does not say how wide its grippers stood; of five ways tried this one come
 Frame = Literal["root", "arm_base", "arm_alone"]
 """Coordinate frame of a workspace. `root`: all links in the URDF's root frame, which gives the paper's figures. `arm_base`: all
 links in the frame of the link that carries the arm's first joint, which is what its text says. `arm_alone`: in that frame the
-links of this arm only, so that neither a body nor the height of a stand counts (ours)."""
+links of this arm only, so neither a body nor the height of a stand counts (ours)."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +46,6 @@ class Features:
     """Workspaces of several robots over several seeds."""
 
     robots: tuple[str, ...]
-    """Names of the robots, in the order of all arrays."""
     dof: np.ndarray
     """[n] int, number of joints of one arm."""
     links: np.ndarray
@@ -63,16 +61,9 @@ class Features:
 def measure(
     robots: Mapping[str, RobotSpec | Urdf], seeds: Sequence[int] = (0,), frame: Frame = "root", workers: int = -1
 ) -> Features:
-    """Kinematic distances and features of robots, one draw of configurations for each seed.
+    """Kinematic distances and features of robots, by name, in a frame; one draw of configurations for each seed.
 
-    Args:
-        robots: entries of ROBOTS or URDFs, by name.
-        seeds: seeds of the sampling, one draw for each.
-        frame: frame that the clouds are in.
-        workers: threads that compare clouds; -1 for one a core.
-
-    Returns:
-        Features of n robots over s seeds.
+    `workers` threads compare the clouds, -1 for one a core.
     """
     draws = [[workspace(robot, seed, frame) for robot in robots.values()] for seed in seeds]
     return Features(
@@ -86,7 +77,7 @@ def measure(
 
 
 def chamfer_floor(robots: Mapping[str, RobotSpec | Urdf], seeds: Sequence[int] = (0,)) -> np.ndarray:
-    """Distance of each robot from itself in another draw [s n] float64 [m], so what sampling makes of no distance. Ours."""
+    """Chamfer distance of each robot to another draw of itself [s n] float64 [m]: the floor that sampling sets. Ours."""
 
     def measure_to_itself(robot: RobotSpec | Urdf, seed: int) -> float:
         return chamfer(workspace_cloud(robot, seed), workspace_cloud(robot, seed + ANOTHER_DRAW))
@@ -95,16 +86,14 @@ def chamfer_floor(robots: Mapping[str, RobotSpec | Urdf], seeds: Sequence[int] =
 
 
 def workspace(robot: RobotSpec | Urdf, seed: int = 0, frame: Frame = "root") -> Workspace:
-    """Sample where the links of a robot can be.
+    """Sample the positions that the links of a robot reach.
 
-    One draw is 1,500 configurations of the first (left) arm, uniform within the URDF's joint limits, with the gripper open
-    and all other joints at zero. It gives the origins of all links of the URDF, of which 4,000 are kept at random. Where
-    the paper leaves a choice open (one arm, gripper open, root frame), this is the choice that comes nearest to its
-    published distances.
+    One draw is 1,500 configurations of the first (left) arm, uniform within the URDF's joint limits. The gripper is open, all
+    other joints are at zero. 4,000 of the link origins are kept at random. Where the paper leaves a choice open, this one comes
+    nearest to its published distances.
 
     Args:
-        robot: an entry of ROBOTS; or any URDF, of which the joints up to the last revolute one of its longest chain are
-            sampled and all others stay at zero.
+        robot: an entry of ROBOTS, or a URDF, whose longest chain up to its last revolute joint is sampled.
         seed: seed of the sampling.
         frame: frame of the cloud.
 

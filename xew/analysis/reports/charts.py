@@ -1,7 +1,7 @@
-"""Charts of a report: panels with one legend, and the numbers that they draw.
+"""Charts of a report: panels with one legend, and their numbers.
 
-On the page each panel is an SVG of its own, so that they stand one below the other on a narrow screen, and takes its colors
-from the page, light or dark. For Markdown and LaTeX all panels are one PNG and one PDF.
+On the page each panel is its own SVG, which takes its colors from the page. For Markdown and LaTeX all panels are one PNG and
+one PDF.
 """
 
 import io
@@ -31,7 +31,7 @@ THEME = {INK: "ink", SOFT: "soft", LINE: "line", GROUND: "page"} | {color: f"c{i
 PANEL = (3.5, 2.5)
 """Width and height of a panel [inches]."""
 ONE_HEIGHT = 0.1
-"""Least difference in height between the words beside two points, as a part of all heights in a panel."""
+"""Least difference in height between the labels of two points, as a part of all heights in a panel."""
 ROUNDS = 20
 """Number of times that words which overlap move apart; each time they may come to overlap others."""
 STYLE: dict[Any, Any] = {
@@ -75,7 +75,6 @@ class Panel:
 
     title: str
     draw: Callable[[Axes], None]
-    """Function that draws it."""
     height: float = PANEL[1]
     """Height [inches]."""
 
@@ -85,11 +84,9 @@ class Chart:
     """Panels with one legend."""
 
     name: str
-    """Name of its files."""
     caption: str
     panels: Sequence[Panel]
     data: pd.DataFrame
-    """Numbers that are drawn, as a tidy frame."""
     legend: Sequence[Series] = ()
     columns: int = 2
 
@@ -135,7 +132,7 @@ def chart_files(chart: Chart) -> dict[str, bytes]:
         if handles:
             figure.legend(handles=handles, loc="outside upper center", ncols=min(4, len(handles)), frameon=False)
         figure.draw_without_rendering()
-        figure.set_layout_engine("none")  # every file would lay it out anew
+        figure.set_layout_engine("none")  # every file would lay it out again
         png, pdf = io.BytesIO(), io.BytesIO()
         figure.savefig(png, format="png", dpi=160)
         figure.savefig(pdf, format="pdf", metadata={"CreationDate": None})
@@ -149,14 +146,10 @@ def _handle(series: Series) -> Line2D:
 
 
 def bars(axes: Axes, labels: Sequence[str], groups: Sequence[tuple[str, np.ndarray, np.ndarray]], unit: str) -> None:
-    """Draw horizontal bars: for each label one bar of each group, whiskers, and the paper's value as a ring.
+    """Draw horizontal bars with whiskers, one of each group for each label, and the paper's values as rings.
 
-    Args:
-        axes: to draw on.
-        labels: n labels from top to bottom.
-        groups: of each its color, values with the ends of their intervals [n 3] and the paper's values [n], in `unit`; NaN
-            where there is none, infinite where a gain is over zero. What is longer than LONGEST_BAR is written on its bar.
-        unit: text at the axis of values.
+    A group is its color, values with interval ends [n 3] and the paper's values [n]: NaN if unknown, infinite for a gain over
+    zero.
     """
     height = 0.8 / len(groups)
     for g, (color, values, paper) in enumerate(groups):
@@ -190,7 +183,7 @@ def scatter(axes: Axes, distance: np.ndarray, score: np.ndarray, robots: Sequenc
     axes.scatter(distance, score, color=INK, s=24, zorder=3)
     heights = _spread(score, ONE_HEIGHT * np.ptp(score))
     for x, y, robot in zip(distance, heights, robots, strict=True):
-        # Words stand towards the middle, so that none leaves the panel.
+        # Words stand towards the middle, so none leaves the panel.
         side, shift = ("right", -7) if x > ends.mean() else ("left", 7)
         text = axes.annotate(robot, (x, y), xytext=(shift, 0), textcoords="offset points", ha=side, va="center")
         text.set_path_effects([patheffects.withStroke(linewidth=3, foreground=GROUND)])

@@ -1,7 +1,4 @@
-"""The report's HTML, from the templates beside this file. Text in, markup out; `report` reads and writes files.
-
-Every value is escaped by the templates, except markup that these functions have made.
-"""
+"""The report's HTML, from the templates next to this file, which escape every value except markup from these functions."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -9,19 +6,17 @@ from itertools import groupby
 from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
-from markupsafe import Markup, escape
+from markupsafe import Markup
 
+from xew.analysis.reports import pictures
+from xew.analysis.reports.answer import Answer
 from xew.analysis.reports.charts import Chart, panel_svg, themed_color
+from xew.analysis.reports.study_strips import Strip
 from xew.analysis.tables.findings import Finding
 from xew.analysis.tables.table import Column, Table, TableRow
 
-__all__ = [
-    "Markup", "anchor", "chart", "claims", "contents", "definitions", "details", "escape", "labeled_picture", "link", "note",
-    "page", "paragraph", "section", "table",
-]  # fmt: skip
-
 MOST_COLUMNS = 10
-"""Largest number of columns of values that stand beside one another on a page of 1400 pixels, unless one group has more."""
+"""Largest number of columns of values side by side on a page of 1400 pixels, unless one group has more."""
 TEMPLATES = Environment(
     loader=PackageLoader("xew.analysis.reports"),
     autoescape=True,
@@ -31,9 +26,15 @@ TEMPLATES = Environment(
 )
 
 
-def page(title: str, finding: Sequence[str], parts: Sequence[Markup], footer: str) -> str:
-    """The whole page: its findings as a list, then its sections."""
-    return TEMPLATES.get_template("page.html").render(title=title, finding=finding, parts=parts, footer=footer)
+def page(title: str, finding: Sequence[str], parts: Sequence[Markup], footer: str, first: Answer | None = None) -> str:
+    """The whole page: the first screen, the results as a list, then the sections."""
+    figures = []
+    if first and first.strip:
+        figures.append(strip(first.strip))
+    if first and first.chart:
+        figures.append(chart(first.chart))
+    values = {"title": title, "answer": first and first.sentence, "figures": figures, "finding": finding}
+    return TEMPLATES.get_template("page.html").render(**values, parts=parts, footer=footer)
 
 
 def section(title: str, *parts: Markup) -> Markup:
@@ -61,7 +62,7 @@ def paragraph(text: str) -> Markup:
 
 
 def link(text: str, target: str) -> Markup:
-    """A paragraph that leads to a file beside the page."""
+    """A paragraph that leads to a file next to the page."""
     return _render("text.html", "link", text, target)
 
 
@@ -83,7 +84,7 @@ def table(table: Table) -> Markup:
 
 @dataclass(frozen=True)
 class _Band:
-    """Columns of a table that stand beside one another."""
+    """Columns of a table that are side by side."""
 
     first: int
     columns: tuple[Column, ...]
@@ -117,7 +118,6 @@ class _Label:
 
     text: str
     leads: bool
-    """Whether it stands in the first column."""
     rows: int = 0
     """Number of rows that it stands for; 0 for a label that belongs to its row alone."""
 
@@ -134,7 +134,7 @@ def _labels(rows: Sequence[TableRow], index: int) -> Iterator[_Label]:
 
 
 def chart(chart: Chart) -> Markup:
-    """A chart with its legend; panels stand beside or below one another, as there is room."""
+    """A chart with its legend; panels are side by side or stacked."""
     panels = [Markup(panel_svg(chart, panel)) for panel in chart.panels]
     kinds = {"-": "line", "--": "dashed", "-.": "dashdot", ":": "dotted", "o": "ring"}
     legend = [{"label": one.label, "kind": kinds[one.dash], "color": themed_color(one.color)} for one in chart.legend]
@@ -142,16 +142,13 @@ def chart(chart: Chart) -> Markup:
 
 
 def labeled_picture(source: str, caption: str, columns: Sequence[str], rows: Sequence[str], title: str = "") -> Markup:
-    """A sheet of pictures with the names of its columns above and of its rows at the left.
-
-    Args:
-        source: data URI of the picture.
-        caption: text after the title, which stands in bold.
-        columns: names of the columns.
-        rows: names of the rows.
-        title: beginning of the caption, if any.
-    """
+    """A data URI's picture with labels of its columns above and of its rows at the left; the title is bold."""
     return _render("figures.html", "labeled_picture", source, title, caption, columns, rows)
+
+
+def strip(shown: Strip) -> Markup:
+    """A sheet of frames with its labels and its caption."""
+    return labeled_picture(pictures.data_uri(shown.image), shown.caption, shown.columns, shown.rows)
 
 
 def claims(findings: Sequence[Finding], papers: Sequence[Finding] | None, by_paper: Sequence[Finding] | None = None) -> Markup:

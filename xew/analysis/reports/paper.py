@@ -1,4 +1,4 @@
-"""The report on the paper's own figures; `report --paper` writes it: its tables, and its claims asked of its own figures."""
+"""The report of `report --paper`: the paper's tables, and its claims tested on its own figures."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -14,21 +14,20 @@ from xew.analysis.tables.distances import (
     certainty_table,
     correlation_table,
     distance_tables,
-    format_signed,
     printed_distances,
 )
 from xew.analysis.tables.findings import FAILS, HOLDS, UNMEASURED, UNRESOLVED, Finding, ask
 from xew.analysis.tables.layouts import build_tables, count_table
-from xew.analysis.tables.table import TableCell
+from xew.analysis.tables.table import TableCell, format_signed
 
 TITLE = "The paper's figures, rebuilt from one another"
 PRIMARY = "lpips"
 """Primary outcome of the paper, which calls all others exploratory."""
 CLAIMS_TEXT = (
-    "Each claim of the paper as an inequality, asked of its own printed figures: it holds where all that prints the same lies "
-    "on its side. Gaps of unseen robots are unresolved, because it prints no model that saw them, and so is what rests on five "
-    "robots alone. The last ones, “ours”, ask more than the paper claims. The paper prints no intervals, so a claim that holds "
-    "here holds for its episodes; whether it would for others its figures cannot say."
+    "Each claim of the paper is tested on its own printed figures. It holds if all values that print the same lie on its side. "
+    "Gaps of unseen robots are unresolved, because no model that saw them is printed, and so are claims that rest on five "
+    "robots. Claims marked “ours” are stricter than the paper's. The paper prints no intervals, so an answer is about its own "
+    "episodes only."
 )
 
 
@@ -42,12 +41,7 @@ class PrintedBuilder(Builder):
 
 
 def build(paper: Paper, footer: str) -> Report:
-    """The page, Markdown, LaTeX and CSV of all tables.
-
-    Args:
-        paper: its figures.
-        footer: text of the footer, versions.
-    """
+    """The report on the paper's figures."""
     grades, known = PaperGrades(paper, paper.infos), printed_distances(paper)
     builder, findings = PrintedBuilder(grades, None), ask(grades)
     tables = [*build_tables(builder), count_table(builder), *distance_tables(known)]
@@ -56,6 +50,7 @@ def build(paper: Paper, footer: str) -> Report:
     assert chart is not None  # all folds are printed
     content = Content(
         TITLE,
+        None,
         [*describe_correlations(paper), describe_claims(findings)],
         {"paper": findings},
         CLAIMS_TEXT,

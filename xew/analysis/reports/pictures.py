@@ -14,7 +14,6 @@ GAP = 4
 DIFFERENCE_FULL = 96
 """Difference, in levels of 255, from which on the difference picture is darkest."""
 FRAME = (208, 215, 222)
-"""Color of the edge of a difference picture, RGB."""
 PNG_COMPRESSION = 9
 """Effort of compressing pictures, 0 to 9: a page holds hundreds of them."""
 
@@ -31,16 +30,7 @@ def difference_picture(predicted: np.ndarray, observed: np.ndarray) -> np.ndarra
 
 
 def fit_to_episode(video: np.ndarray, truth: np.ndarray, frame_zero: str) -> np.ndarray:
-    """Bring a rollout's video to its episode's frames and size, as it was graded.
-
-    Args:
-        video: [t h w 3] uint8, the rollout's as it is stored.
-        truth: [t h w 3] uint8, the episode's.
-        frame_zero: what the score table says; where it is 'absent' the video begins with frame 1.
-
-    Returns:
-        [t h w 3] uint8 with the height and width of `truth`, at most as long.
-    """
+    """A rollout's video [t h w 3] uint8 at the size and frames of its episode `truth` [t h w 3] uint8, as it was graded."""
     video = resize_video(video, truth.shape[1:3])
     if frame_zero == "absent":
         video = np.concatenate([truth[:1], video])

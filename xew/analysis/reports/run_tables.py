@@ -7,10 +7,13 @@ import numpy as np
 import pandas as pd
 
 from xew.analysis.scores import COPY, TRUTH, MetricInfo, Scores
+from xew.analysis.tables.table import format_share
 from xew.protocol import BASELINES, PASTED_RENDER
 from xew.statistics import (
+    BETTER,
     MIN_SCENES,
     UNRESOLVED,
+    WORSE,
     Summary,
     describe_parting,
     describe_power,
@@ -37,7 +40,6 @@ class Row:
     model: str
     condition: str
     scores: dict[str, Interval]
-    """Mean and interval of each metric."""
     verdicts: dict[str, str]
     """Verdict on each metric against the frozen first frame, paired by episode; empty for baselines."""
     over_pasting: dict[str, str] = field(default_factory=dict)
@@ -94,20 +96,19 @@ def robot_table(scores: Scores, title: str, robots: Sequence[str], expected: int
 
 
 def _row(key: tuple[str, str], summary: Summary, metrics: Sequence[str], baselines: Sequence[str]) -> Row:
-    """A row of a table; a model has verdicts against each of these baselines."""
     means, pairs = (t[(t["model"] == key[0]) & (t["condition"] == key[1])] for t in (summary.means, summary.pairs))
     scores = {
         row["metric"]: Interval(row["mean"], row["low"], row["high"], row["episodes"]) for row in means.to_dict("records")
     }
     against: dict[str, dict[str, str]] = {COPY: {}, PASTED_RENDER: {}}
     for name in baselines if key[0] not in BASELINES else ():
-        found = pairs[pairs["other"] == name]
-        against[name] = dict.fromkeys(metrics, UNRESOLVED) | dict(zip(found["metric"], found["verdict"], strict=True))
+        own = pairs[pairs["other"] == name]
+        against[name] = dict.fromkeys(metrics, UNRESOLVED) | dict(zip(own["metric"], own["verdict"], strict=True))
     return Row(*key, scores, against[COPY], against[PASTED_RENDER])
 
 
 def finding(held_out: Sequence[RobotTable], seen: Sequence[RobotTable], metrics: Sequence[MetricInfo]) -> list[str]:
-    """The result in sentences, one for each held-out robot and model: against a frozen frame, and how far from the truth."""
+    """The result in sentences, for each held-out robot and model: compared with both baselines, and with the truth."""
     compared = [(table, row) for table in held_out for row in table.rows if row.verdicts]
     sentences = []
     for table, row in compared:
@@ -116,21 +117,21 @@ def finding(held_out: Sequence[RobotTable], seen: Sequence[RobotTable], metrics:
         ]
         episodes = f"{table.count} episode{'s' if table.count != 1 else ''}"
         sentences.append(
-            f"{table.title} ({episodes}): {row.title} {_compare(row, metrics)}.{_distance_left((table, row), twins, metrics)}"
+            f"{table.title} ({episodes}): {row.title} {_compare(row, metrics)}{_error_left((table, row), twins, metrics)}"
             f"{_parting(row, metrics)}"
         )
-    return sentences or ["No model has been compared with the frozen first frame yet: grade without --no-baselines."]
+    return sentences or ["No model has been compared with the frozen first frame: grade without --no-baselines."]
 
 
-def _distance_left(
+def _error_left(
     own: tuple[RobotTable, Row], seen: Sequence[tuple[RobotTable, Row]], metrics: Sequence[MetricInfo], metric: str = "lpips"
 ) -> str:
     shares = [progress(table, row, metric) for table, row in (own, *seen)]
     if shares[0] is None:
         return ""
     title = next((info.title for info in metrics if info.name == metric), metric)
-    beside = f" (on seen robots {1 - shares[1]:.0%})" if len(shares) > 1 and shares[1] is not None else ""
-    return f" In {title} it is at {1 - shares[0]:.0%} of that frame's distance from the truth{beside}."
+    others = f" ({format_share(1 - shares[1])} on seen robots)" if len(shares) > 1 and shares[1] is not None else ""
+    return f" Its {title} error is {format_share(1 - shares[0])} of the frozen first frame's{others}."
 
 
 def progress(table: RobotTable, row: Row, metric: str) -> float | None:
@@ -143,26 +144,24 @@ def progress(table: RobotTable, row: Row, metric: str) -> float | None:
 
 
 def _compare(row: Row, metrics: Sequence[MetricInfo]) -> str:
-    """What a model beats and what not, by the metrics that decide: of a frozen first frame, and of the pasted render."""
+    """Sentences on a model compared with the frozen first frame and the paste baseline, by the metrics that decide."""
     if all(np.isnan(score.low) for score in row.scores.values()):
-        return f"cannot be told from a frozen first frame by fewer than {MIN_SCENES} scenes"
-    parts = _compare_with("a frozen first frame", row.verdicts, metrics)
-    return "; it ".join([*parts, *_compare_with("the pasted render, which learned nothing,", row.over_pasting, metrics)])
+        return f"cannot be compared with the frozen first frame: fewer than {MIN_SCENES} scenes were graded."
+    text = f"{_compare_with('the frozen first frame', row.verdicts, metrics)}."
+    return text + (f" It {_compare_with('the paste baseline', row.over_pasting, metrics)}." if row.over_pasting else "")
 
 
-def _compare_with(title: str, verdicts: Mapping[str, str], metrics: Sequence[MetricInfo]) -> list[str]:
-    """Phrases on one comparison, of reported metrics that decide: those that are resolved by name, the others by number."""
-    shown = strict_metrics({metric.name: metric for metric in metrics})
-    deciding = [metric for metric in _reported(metrics) if metric.name not in shown]
-    found = {word: [m.title for m in deciding if verdicts.get(m.name) == word] for word in ("better", "worse", "unresolved")}
-    phrases = (("better", "beats"), ("worse", "falls behind"))
-    parts = [f"{phrase} {title} on {_join(found[word])}" for word, phrase in phrases if found[word]]
-    unresolved = found["unresolved"]
-    if unresolved and not parts:
-        parts.append(f"cannot be told from {title} on any of {len(unresolved)} metrics")
-    elif unresolved:
-        parts[-1] += f" ({len(unresolved)} not resolved)"
-    return parts
+def _compare_with(title: str, verdicts: Mapping[str, str], metrics: Sequence[MetricInfo]) -> str:
+    """Predicate on one comparison, of reported metrics that decide: the resolved ones by name, the others by number."""
+    replaced = strict_metrics({metric.name: metric for metric in metrics})
+    deciding = [metric for metric in _reported(metrics) if metric.name not in replaced]
+    titles = {word: [m.title for m in deciding if verdicts.get(m.name) == word] for word in (BETTER, WORSE, UNRESOLVED)}
+    parts = [f"{word} on {_join(titles[word])}" for word in (BETTER, WORSE) if titles[word]]
+    if not parts:
+        return f"differs from {title} on none of {len(titles[UNRESOLVED])} metrics"
+    first = parts[0].replace(" on ", f" than {title} on ", 1)
+    unresolved = f" ({len(titles[UNRESOLVED])} not resolved)" if titles[UNRESOLVED] else ""
+    return f"is {' and '.join([first, *parts[1:]])}{unresolved}"
 
 
 def _reported(metrics: Sequence[MetricInfo]) -> Sequence[MetricInfo]:
@@ -171,12 +170,12 @@ def _reported(metrics: Sequence[MetricInfo]) -> Sequence[MetricInfo]:
 
 
 def _parting(row: Row, metrics: Sequence[MetricInfo]) -> str:
-    """Sentence on where the suites part against a frozen first frame, or ''; strict decides."""
+    """Sentence on metrics whose verdicts differ between the suites, or ''."""
     named = {metric.name: metric for metric in metrics}
     pairs = find_parting(row.verdicts, {metric.name: metric for metric in _reported(metrics)})
     titled = {named[name].title: word for name, word in row.verdicts.items()}
     text = describe_parting([(named[strict].title, named[paper].title) for strict, paper in pairs], titled)
-    return f" The suites part on {text}; strict decides." if pairs else ""
+    return f" The suites disagree on {text}; strict decides." if pairs else ""
 
 
 def _join(names: Sequence[str]) -> str:
@@ -186,7 +185,7 @@ def _join(names: Sequence[str]) -> str:
 def flat_summary(tables: Sequence[RobotTable], metrics: Sequence[MetricInfo]) -> pd.DataFrame:
     """All tables as one tidy frame: robots model condition metric mean low high episodes expected versus_frozen versus_pasted
     decides."""
-    shown = strict_metrics({metric.name: metric for metric in metrics})
+    replaced = strict_metrics({metric.name: metric for metric in metrics})
     return pd.DataFrame(
         {
             "robots": " ".join(table.robots),
@@ -200,7 +199,7 @@ def flat_summary(tables: Sequence[RobotTable], metrics: Sequence[MetricInfo]) ->
             "expected": table.expected,
             "versus_frozen": row.verdicts.get(name, ""),
             "versus_pasted": row.over_pasting.get(name, ""),
-            "decides": name not in shown,
+            "decides": name not in replaced,
         }
         for table in tables
         for row in table.rows

@@ -1,8 +1,4 @@
-"""The report of a study, from a score table with the column `variant`; `report` reads and writes files.
-
-What came out stands first, then the claims with their answers, then a section for each question of the paper: chart, the
-main table, what it looks like, and all metrics folded away.
-"""
+"""The report of a study, from a score table with the column `variant`: results, claims, and a section for each question."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -21,11 +17,12 @@ from xew.analysis.beyond import (
     scaling_table,
 )
 from xew.analysis.paper import AXES, read_paper
-from xew.analysis.reports import page, pictures
+from xew.analysis.reports import page
+from xew.analysis.reports.answer import Answer, answer, answer_strip, study_contests
 from xew.analysis.reports.charts import Chart, chart_files
 from xew.analysis.reports.study_beyond import charts_beyond
 from xew.analysis.reports.study_charts import study_charts
-from xew.analysis.reports.study_strips import Strip, study_strips
+from xew.analysis.reports.study_strips import Strip, find_videos, median_episodes, study_strips
 from xew.analysis.reports.study_text import curves_note, missing_note, part_notes, study_sentences, trainings_note
 from xew.analysis.scores import Scores, find_missing_scores
 from xew.analysis.statistics.grades import PaperGrades, StudyGrades
@@ -52,14 +49,14 @@ from xew.protocol import PAPER_PARTS
 TITLE = "Can the model render a robot that it has never seen?"
 PART_TITLES = {
     "fixed": "Seen and unseen robots",
-    "actions": "How it is told to move",
-    "ladder": "What it is told of the robot's looks",
-    "few_shot": "Adaptation, and what it costs",
+    "actions": "Action representation",
+    "ladder": "Conditioning on the robot's appearance",
+    "few_shot": "Few-shot adaptation and forgetting",
     "loeo": "Does distance predict difficulty?",
     "baselines": "Other world models",
     "scaling": "More bodies in training",
     "bodies": "Distance and difficulty over many bodies",
-    "halves": "Distance and the price of never having seen a body",
+    "halves": "Distance and the gap of unseen bodies",
     "motion": "Shared and own motion",
     "outside": "Outside the protocol",
 }
@@ -85,14 +82,12 @@ METHOD = "How it was measured"
 HERE, BY_PAPER, PRINTED = "here", "here, paper's definitions", "paper"
 """Sources of answers to claims: the scores by the suite strict, the scores by the paper's definitions, the paper's figures."""
 CLAIMS_TEXT = (
-    "Each claim of the paper as inequalities, asked of this study and of the paper's own printed figures. It holds where "
-    "every number lies on its side of the bound, and fails where one lies on the other side, each at 5 % after Holm's "
-    "correction for the comparisons of the claim (for the paper: with all that prints the same); anything else is "
-    "unresolved. “Among all claims” corrects once more, for all of them. That something saturates or is alike is an "
-    "equivalence: two one-sided tests with the margins that the claim names. Metrics of the suite strict decide, in which "
-    "what is lost is an error; where the paper's definitions give another answer, it stands beside. Claims about what a "
-    "model is told also say whether these models beat the first frame with the robot's render pasted in. The last ones, "
-    "“ours”, ask more than the paper claims."
+    "Each claim of the paper is tested as inequalities, on this study and on the paper's printed figures. A claim holds if "
+    "all numbers lie on its side of the bound, and fails if one lies on the other side, at 5 % after Holm's correction within "
+    "the claim. Otherwise it is unresolved. “Among all claims” corrects for all claims. Claims of equality are equivalences: "
+    "two one-sided tests with the margins in the claim. Strict metrics decide; answers by the paper's definitions are shown "
+    "where they differ. Claims about conditioning also say whether the models beat the paste baseline. Claims marked “ours” "
+    "are stricter than the paper's."
 )
 FRAME_CHARTS = {"actions": "frames_actions", "ladder": "frames_ladder"}
 
@@ -105,7 +100,6 @@ class Report:
     markdown: str
     summary: pd.DataFrame
     files: Mapping[str, bytes]
-    """Further files by path relative to the folder."""
 
 
 @dataclass(frozen=True)
@@ -113,20 +107,17 @@ class Content:
     """Everything that the page and the Markdown show."""
 
     title: str
+    first: Answer | None
     sentences: Sequence[str]
     findings: Mapping[str, Sequence[Finding]]
     """Answers to the claims by what they were asked of: HERE, BY_PAPER and PRINTED; the first decides. Empty where none was."""
     claims_text: str
-    """Paragraph that explains the answers."""
     tables: Mapping[str, Table]
     charts: Mapping[str, Chart]
     strips: Mapping[str, Strip] = field(default_factory=dict)
     notes: Sequence[str] = ()
-    """Notes on what is missing."""
     missing: pd.DataFrame = field(default_factory=pd.DataFrame)
-    """Scores that other models have."""
     trainings: str = ""
-    """Sentence that says whether intervals are of one training or of several."""
 
     @property
     def deciding(self) -> Sequence[Finding]:
@@ -146,18 +137,18 @@ def build(
 
     Args:
         scores: with the column `variant`.
-        data: the data set, for pictures.
-        rollouts: trees of rollouts named after their variants, or folders that hold such trees; for pictures.
-        distances: folder of the command of distances; the paper's printed ones where None.
-        footer: text of the footer, versions.
-        other_motion: scores of the same study in the other kind of motion, if there are any.
+        data, rollouts: for pictures; trees of rollouts are named after their variants, or are folders of such trees.
+        distances: folder of the distance command; None for the paper's printed distances.
+        footer: text of the footer.
+        other_motion: scores of the same study in the other kind of motion.
 
     Raises:
-        ConfigError: a file that was named cannot be read, or both studies are of one kind of motion.
+        ConfigError: a named file cannot be read, or both studies are of one kind of motion.
     """
     paper = read_paper()
     known = read_distances(distances) if distances else printed_distances(paper)
-    strips = study_strips(scores, data, rollouts) if data and rollouts else {}
+    videos = find_videos(rollouts) if data and rollouts else {}
+    strips = study_strips(scores, data, videos) if data else {}
     axes, spreads = ({axis: known.of(axis, column) for axis in AXES} for column in ("value", "spread"))
     grades = StudyGrades(scores.rows, scores.metrics, axes, known.measured, spreads, codecs=scores.codecs)
     printed = PaperGrades(paper, scores.metrics)
@@ -172,8 +163,11 @@ def build(
     of_paper = any(builder.has_results(part) for part in PAPER_PARTS)
     findings, by_paper, by_print = (ask(g) if of_paper else [] for g in (StrictGrades(grades), grades, printed))
     missing = find_missing_scores(scores.rows)
+    contests = list(study_contests(grades))
+    shown = median_episodes({robot: variant for robot, variant, _ in contests}, scores.rows, data, videos) if data else {}
     content = Content(
         TITLE,
+        answer([contest for *_, contest in contests], answer_strip(shown, scores.frame_zero)),
         study_sentences(grades, known, (difficulty.get("lpips"), gaps.get("lpips")), motions, findings, by_paper),
         {HERE: findings, BY_PAPER: by_paper, PRINTED: by_print} if of_paper else {},
         CLAIMS_TEXT,
@@ -210,12 +204,11 @@ def _make_tables(builder: Builder, scores: Scores, known: Distances, notes: Sequ
 
 
 def _write_html(content: Content, endings: Mapping[str, Markup], footer: str) -> str:
-    """The page."""
     sections = {"Claims": _claims_section(content)} if content.findings else {}
     sections |= {PART_TITLES[part]: text for part in SECTIONS if (text := _part_section(content, part))}
     sections |= endings
     head = [page.contents(list(sections)), *map(page.note, content.notes)]
-    return page.page(content.title, content.sentences, [*head, *sections.values()], footer)
+    return page.page(content.title, content.sentences, [*head, *sections.values()], footer, content.first)
 
 
 def _claims_section(content: Content) -> Markup:
@@ -232,9 +225,7 @@ def _part_section(content: Content, part: str) -> Markup | None:
     parts = [page.chart(content.charts[name]) for name in charts if name in content.charts]
     parts += [page.table(content.tables[name]) for name in shown if name in content.tables]
     if part in content.strips:
-        strip = content.strips[part]
-        source = pictures.data_uri(strip.image)
-        parts.append(page.labeled_picture(source, strip.caption, strip.columns, strip.rows))
+        parts.append(page.strip(content.strips[part]))
     if FRAME_CHARTS.get(part) in content.charts:
         parts.append(page.chart(content.charts[FRAME_CHARTS[part]]))
     hidden = [content.tables[name] for name in folded if name in content.tables]
@@ -250,11 +241,9 @@ def _method_section(content: Content, scores: Scores) -> Markup:
         METHOD,
         page.paragraph(
             f"Means over episodes with 95 % bootstrap intervals. {content.trainings} Scenes (seeds) are resampled within their "
-            "tasks, the same ones for every model and robot, so that all comparisons are paired. Behind a value, against the "
-            "row that the caption names: "
-            f"{MARKS}. “True video, graded” is the truth in the model's place: what it lacks is the estimators' own error, "
-            "the noise floor. The paper's values are of its own renders and a model of five billion weights; they stand "
-            "beside ours where its protocol is the same."
+            "tasks, the same for every model and robot, so all comparisons are paired. Marks compare a value with the row in "
+            f"the caption: {MARKS}. “True video, graded” has the estimators' error, the noise floor. The paper's values come "
+            "from its own renders and a model of five billion weights; they are shown where its protocol is the same."
         ),
         page.table(content.tables["counts"]),
         page.definitions(definitions),
@@ -266,6 +255,8 @@ def _write_markdown(content: Content) -> str:
     lines = [
         f"# {content.title}",
         "",
+        *([content.first.sentence, ""] if content.first else []),
+        *([f"![{content.first.chart.caption}](figures/answer.png)", ""] if content.first and content.first.chart else []),
         *(f"- {plain_markdown(sentence)}" for sentence in content.sentences),
         "",
         *(f"> {note}\n" for note in content.notes),
@@ -296,7 +287,8 @@ def _files(content: Content) -> Iterator[tuple[str, bytes]]:
     for name, table in content.tables.items():
         yield f"tables/{name}.tex", formats.latex(table).encode()
         yield f"tables/{name}.csv", csv_text(formats.table_frame(table)).encode()
-    for chart in content.charts.values():
+    first = [content.first.chart] if content.first and content.first.chart else []
+    for chart in (*first, *content.charts.values()):
         for name, data in chart_files(chart).items():
             yield f"figures/{name}", data
     for part, strip in content.strips.items():

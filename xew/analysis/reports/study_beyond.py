@@ -1,4 +1,4 @@
-"""Charts beyond the paper: of bodies the gap by their number in training, error and gap by distance; both kinds of motion."""
+"""Charts of the tables in `xew.analysis.beyond`."""
 
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -13,19 +13,16 @@ from xew.analysis.reports import charts
 from xew.analysis.reports.charts import SERIES, SOFT, Chart, Panel, Series
 from xew.analysis.statistics.grades import SEEN
 from xew.analysis.tables.builder import Builder
-from xew.analysis.tables.distances import AXIS_TITLES, format_signed
+from xew.analysis.tables.distances import AXIS_TITLES
 from xew.analysis.tables.labels import ACTIONS, GROUP_TITLES, HELD_OUT_TITLES
-from xew.analysis.tables.table import metric_title
+from xew.analysis.tables.table import format_signed, metric_title
 from xew.protocol import MOTIONS
 
 METRIC = "lpips"
-"""Metric that the charts draw, the paper's primary outcome."""
 KINDS = {kind: Series(kind, color) for kind, color in zip((WITH_ROBOTS, ALONE), SERIES, strict=False)}
-"""Lines of the chart of scaling, by what a model was trained on."""
 UNLEARNED = Series(PASTED, SOFT, "-.")
 """Line there of what learned nothing."""
 MOTION_COLORS = dict(zip(MOTIONS, SERIES, strict=False))
-"""Colors of the kinds of motion."""
 
 
 def charts_beyond(

@@ -24,8 +24,8 @@ from xew.statistics import Mean
 
 BAR_METRICS = ("lpips", "region_lpips", "mask_iou", "pck")
 CURVE_METRIC = "lpips"
+MEAN_DISTANCE = "mean distance to the other four"
 DASHES: Mapping[str, Literal["--", "-.", ":"]] = {COPY: "--", PASTED_RENDER: "-.", TRUTH: ":"}
-"""Line styles of the baselines that charts show."""
 ROBOT_COLORS = dict(zip(HELD_OUT_ROBOTS, SERIES, strict=False))
 
 
@@ -153,12 +153,7 @@ def _draw_by_shots(axes: Axes, data: pd.DataFrame, columns: list[str], styles: M
 
 
 def _adaptation_rows(builder: Builder, remedies: Mapping[str, str]) -> Iterator[dict[str, object]]:
-    """LPIPS before and after each adaptation, on its target and on UR5, here and in the paper.
-
-    Args:
-        builder: of the study.
-        remedies: endings of the rows of each remedy, by its key.
-    """
+    """LPIPS before and after each adaptation, on its target and on UR5; `remedies` maps remedies to endings of rows."""
     sources: list[tuple[str, Grades]] = [("here", builder.ours)]
     if builder.paper and set(remedies) == {"full"}:
         sources.append(("paper", builder.paper))
@@ -208,16 +203,14 @@ def _by_distance(
     panels = [
         Panel(
             AXIS_TITLES[axis],
-            partial(_scatter, distance=distances.of(axis), score=scores, robots=robots, axis=axis, title=title),
+            partial(
+                charts.scatter, distance=distances.of(axis), score=scores, robots=robots, xlabel=MEAN_DISTANCE, ylabel=title
+            ),
         )
         for axis in axes
     ]
     data = pd.DataFrame({"robot": ROBOT_NAMES, metric: scores} | {axis: distances.of(axis) for axis in axes})
     return Chart(name, caption, panels, data)
-
-
-def _scatter(axes: Axes, distance: np.ndarray, score: np.ndarray, robots: Sequence[str], axis: str, title: str) -> None:
-    charts.scatter(axes, distance, score, robots, "mean distance to the other four", title)
 
 
 def frame_chart(curves: pd.DataFrame, part: str, labels: Mapping[str, str]) -> Chart:
@@ -255,12 +248,7 @@ def _chart_by_frame(
 ) -> Chart:
     """Means by frame with bands of the middle half of the episodes, a panel for each metric and robot.
 
-    Args:
-        name, caption: of the chart.
-        rows: scores by frame; the column `row` has the label of the line.
-        styles: lines of the models; those of the baselines come behind them.
-        titles: axis title of each metric.
-        robots: in the order of the panels.
+    `rows` has the label of the line in its column `row`; baselines are drawn after `styles`.
     """
     grouped = rows.groupby(["metric", "robot", "row", "frame"], sort=False, observed=True)["value"]
     data = pd.DataFrame({"mean": grouped.mean(), "low": grouped.quantile(0.25), "high": grouped.quantile(0.75)}).reset_index()

@@ -1,4 +1,4 @@
-"""Strips of a study: the same scene and moment under several variants, robots down and conditions across."""
+"""Strips of a study: one scene and moment under several variants, robots down and conditions across."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ import pandas as pd
 from xew.analysis.reports import pictures
 from xew.analysis.scores import VARIANT, Scores
 from xew.analysis.statistics.grades import find_variant
-from xew.analysis.tables.labels import ACTIONS, LADDER, SHORT_ROBOTS, SYSTEMS
+from xew.analysis.tables.labels import ACTIONS, LADDER, ROBOT_TITLES, SHORT_ROBOTS, SYSTEMS
 from xew.config import ConfigError
 from xew.episode import episode_folder, read_video
 from xew.protocol import HELD_OUT_ROBOTS, ROBOT_NAMES, SHOTS, VARIANTS
@@ -19,7 +19,6 @@ from xew.rollout import Rollout, find_rollouts, read_rollout_video
 RANKED_BY = "lpips"
 """Metric by which the median scene is found."""
 Videos = dict[tuple[str, str, int, str], Rollout]
-"""Rollouts by variant, task, seed and robot."""
 
 
 @dataclass(frozen=True)
@@ -27,29 +26,18 @@ class Strip:
     """A sheet of frames with its labels."""
 
     image: bytes
-    """PNG file."""
     caption: str
     columns: Sequence[str]
     rows: Sequence[str]
 
     @property
     def labeled_caption(self) -> str:
-        """The caption with what is shown where, for pages that cannot set labels beside a picture."""
+        """The caption with the labels, for pages that cannot set labels next to a picture."""
         return f"{self.caption} From the left: {', '.join(self.columns)}; from the top: {', '.join(self.rows)}."
 
 
-def study_strips(scores: Scores, data: Path, rollouts: Sequence[Path]) -> dict[str, Strip]:
-    """A strip for each comparison of which at least two variants can be shown.
-
-    Args:
-        scores: the study's; the scene whose mean LPIPS over what is shown is the median is taken.
-        data: the data set.
-        rollouts: trees named after their variants, or folders of such trees.
-
-    Raises:
-        ConfigError: none of the folders holds a variant's rollouts.
-    """
-    videos = find_videos(rollouts)
+def study_strips(scores: Scores, data: Path, videos: Videos) -> dict[str, Strip]:
+    """A strip for each comparison of which at least two variants can be shown, of the scene with the median LPIPS."""
     adapted = {f"M = {shots}": {robot: f"{robot}-{shots}" for robot in HELD_OUT_ROBOTS} for shots in (0, *SHOTS)}
     others = dict(zip(ROBOT_NAMES, (*ROBOT_NAMES[1:], ROBOT_NAMES[0]), strict=True))
     wanted = {
@@ -57,17 +45,36 @@ def study_strips(scores: Scores, data: Path, rollouts: Sequence[Path]) -> dict[s
         "ladder": {label: dict.fromkeys(HELD_OUT_ROBOTS, row) for row, label in LADDER.items()},
         "few_shot": adapted,
         "loeo": {
-            "of a model that never saw it": {robot: f"loeo_{robot}" for robot in ROBOT_NAMES},
-            "of one that did": {robot: f"loeo_{other}" for robot, other in others.items()},
+            "model that never saw the robot": {robot: f"loeo_{robot}" for robot in ROBOT_NAMES},
+            "model that did": {robot: f"loeo_{other}" for robot, other in others.items()},
         },
         "baselines": {label: dict.fromkeys(HELD_OUT_ROBOTS, row) for row, label in SYSTEMS.items()},
     }
-    made = {part: _make_strip(part, columns, scores, data, videos) for part, columns in wanted.items()}
-    return {part: strip for part, strip in made.items() if strip is not None}
+    strips = {part: _make_strip(part, columns, scores, data, videos) for part, columns in wanted.items()}
+    return {part: strip for part, strip in strips.items() if strip is not None}
+
+
+def median_episodes(
+    variants: Mapping[str, str], rows: pd.DataFrame, data: Path, videos: Videos
+) -> dict[str, tuple[Path, Rollout]]:
+    """By the robot's title: folder and rollout of the episode with the median LPIPS, for a variant of each robot's key."""
+    episodes = {}
+    for robot, variant in variants.items():
+        graded = rows[(rows["metric"] == RANKED_BY) & (rows[VARIANT] == variant) & (rows["robot"] == robot)]
+        scenes = graded.sort_values(["value", "task", "seed"])[["task", "seed"]].itertuples(index=False, name=None)
+        keys = [key for task, seed in scenes if (key := (variant, task, seed, robot)) in videos]
+        if keys:
+            _, task, seed, _ = key = keys[len(keys) // 2]
+            episodes[ROBOT_TITLES[robot]] = episode_folder(data, task, seed, robot), videos[key]
+    return episodes
 
 
 def find_videos(folders: Sequence[Path]) -> Videos:
-    """All rollouts of variants under some folders."""
+    """All rollouts of variants in trees that are named after them, or in folders of such trees.
+
+    Raises:
+        ConfigError: none of the folders holds a variant's rollouts.
+    """
     trees = {tree.name: tree for folder in folders for tree in (folder, *_children(folder)) if tree.name in VARIANTS}
     if not trees:
         raise ConfigError(
@@ -103,7 +110,7 @@ def _make_strip(
         predicted = [read_rollout_video(videos[names[label][robot], task, seed, robot]) for label in labels]
         shown.append([truth, *(pictures.fit_to_episode(video, truth, scores.frame_zero) for video in predicted)])
     moment = min(len(video) for row in shown for video in row) - 1
-    caption = f"{task.replace('_', ' ')}, seed {seed}, frame {moment}: the scene whose LPIPS is the median of those shown."
+    caption = f"{task.replace('_', ' ')}, seed {seed}, frame {moment}: the scene with the median LPIPS."
     image = pictures.encode_png(pictures.sheet([[video[moment] for video in row] for row in shown]))
     return Strip(image, caption, ["observed", *labels], [SHORT_ROBOTS[robot] for robot in robots])
 

@@ -1,4 +1,4 @@
-"""What came out of a study, in sentences, with notes on what its intervals are over and on what is missing."""
+"""Sentences of a study's report: its results, what its intervals cover, and what is missing."""
 
 from collections.abc import Iterator, Sequence
 
@@ -11,25 +11,25 @@ from xew.analysis.scores import Scores, describe_scores
 from xew.analysis.statistics.grades import BODIES, Grades, StudyGrades, relative_gain
 from xew.analysis.tables.builder import Builder
 from xew.analysis.tables.comparisons import OTHER_ROBOTS, NotMeasuredError, Reader
-from xew.analysis.tables.distances import Distances, correlate, format_signed
+from xew.analysis.tables.distances import Distances, correlate
 from xew.analysis.tables.findings import BEATS, FAILS, HOLDS, UNMEASURED, UNRESOLVED, Finding
 from xew.analysis.tables.labels import ACTIONS, LADDER, REMEDIES, ROBOT_TITLES, SHORT_ROBOTS
+from xew.analysis.tables.table import format_change, format_signed
 from xew.protocol import BODY_SCALES, FORGETTING_ROBOT, HELD_OUT_ROBOTS, PAPER_PARTS, PARTS
-from xew.statistics import strict_metrics
+from xew.statistics import LEVEL, Mean, strict_metrics
 
 
 def trainings_note(grades: StudyGrades) -> str:
-    """Sentence that says what the intervals of a study's tables are over: of this training, or of several."""
+    """Sentence that says whether a study's intervals cover one training run of each model, or several."""
     counts = {name: grades.trainings(name) for name in grades.variants}
     several = {name: count for name, count in counts.items() if count > 1}
     if not several:
-        return "Every interval is of this training: one of each model, over scenes." if counts else ""
+        return "Each model was trained once; intervals cover scenes, not training runs." if counts else ""
     if len(set(counts.values())) == 1:
-        return f"Intervals are over {next(iter(counts.values()))} trainings of each model, and over scenes."
+        return f"Each model was trained {next(iter(counts.values()))} times; intervals cover training runs and scenes."
     named = ", ".join(f"{name} ({count})" for name, count in several.items())
-    rest = ", ".join(name for name in counts if name not in several)
-    ending = f"; those of {rest} are of this training" if rest else ""
-    return f"Intervals are over scenes and the trainings of {named}{ending}."
+    rest = " The other models were trained once." if len(several) < len(counts) else ""
+    return f"Intervals cover scenes and the training runs of {named}.{rest}"
 
 
 def study_sentences(
@@ -42,202 +42,202 @@ def study_sentences(
 ) -> list[str]:
     """The results in sentences, one for each question that was asked; `over_bodies` are errors and gaps in LPIPS."""
     errors, gaps = over_bodies
-    asked = [
-        *_gap_sentence(grades),
+    return [
+        *([_answer_sentence(findings)] if findings else []),
+        *pasting_sentence(findings),
+        *parting_sentence(findings, by_paper, bool(strict_metrics(grades.metrics))),
+        *_gap_sentences(grades),
         *_best_sentences(grades),
         *_adaptation_sentences(grades),
-        *_distance_sentence(grades, distances),
+        *_distance_sentences(grades, distances),
         *_scaling_sentence(grades),
         *_bodies_sentence(errors),
         *_halves_sentence(gaps),
         *_motion_sentences(motions),
     ]
-    return [
-        *([_answer_sentence(findings)] if findings else []),
-        *pasting_sentence(findings),
-        *parting_sentence(findings, by_paper, bool(strict_metrics(grades.metrics))),
-        *asked,
-    ]
 
 
 def pasting_sentence(findings: Sequence[Finding]) -> Iterator[str]:
-    """Sentence on how many claims about a rung or a stream speak of models that beat the pasted render."""
-    counts = {answer: [f.claim.name for f in findings if f.pasting == text] for answer, text in BEATS.items()}
-    asked = sum(len(names) for answer, names in counts.items() if answer != UNMEASURED)
-    if asked:
-        yield (
-            f"Of {asked} claims about what a model is told, in {len(counts[HOLDS]) or 'none'} all models that it speaks for "
-            f"beat the pasted render, which learned nothing; in {len(counts[FAILS]) or 'none'} one is worse than that, and "
-            f"{len(counts[UNRESOLVED]) or 'none'} cannot be told."
-        )
+    """Sentence on how many claims about conditioning concern models that beat the paste baseline."""
+    counts = {answer: sum(finding.pasting == text for finding in findings) for answer, text in BEATS.items()}
+    asked = sum(counts.values()) - counts[UNMEASURED]
+    if asked == 1:
+        answer = next(answer for answer in (HOLDS, FAILS, UNRESOLVED) if counts[answer])
+        ends = {
+            HOLDS: "all of its models are better than the paste baseline",
+            FAILS: "at least one of its models is worse than the paste baseline",
+            UNRESOLVED: "the comparison of its models with the paste baseline is unresolved",
+        }
+        yield f"One claim concerns conditioning; {ends[answer]}."
+    elif asked:
+        ends = {
+            HOLDS: "all models of {} are better than the paste baseline",
+            FAILS: "{} include at least one model that is worse than the paste baseline",
+            UNRESOLVED: "the comparison with the paste baseline is unresolved for {}",
+        }
+        parts = [
+            text.format("all" if counts[answer] == asked else counts[answer]) for answer, text in ends.items() if counts[answer]
+        ]
+        yield f"{asked} claims concern conditioning: {'; '.join(parts)}."
     elif counts[UNMEASURED]:
-        yield "Whether models beat the pasted render, which learned nothing, cannot be told: it was not graded."
+        yield "The pasted render was not graded, so no model is compared with the paste baseline."
 
 
 def find_parting_claims(findings: Sequence[Finding], by_paper: Sequence[Finding]) -> list[tuple[Finding, Finding]]:
-    """Claims of which the two suites give another answer, with that of strict and that of the paper's definitions."""
+    """Claims with two different answers: by the strict metrics, and by the paper's definitions."""
     return [(ours, other) for ours, other in zip(findings, by_paper, strict=True) if ours.answer != other.answer]
 
 
 def parting_sentence(findings: Sequence[Finding], by_paper: Sequence[Finding], graded: bool) -> Iterator[str]:
-    """Sentence on the claims on which the suites part; none where no claim could be asked.
+    """Sentence on the claims that strict metrics and the paper's definitions answer differently.
 
-    Args:
-        findings: by the suite strict.
-        by_paper: by the paper's definitions.
-        graded: whether any metric of the suite strict was graded that stands in the place of one of the paper's.
+    None where no claim could be tested; `graded` says whether any strict metric replaces one of the paper's.
     """
     if all(finding.answer == UNMEASURED for finding in findings):
         return
     if not graded:
-        yield "The suite strict was not graded: all answers are by the paper's definitions."
+        yield "No strict metric was graded, so all answers use the paper's metric definitions."
         return
     parts = [
-        f"{ours.claim.says.strip('… ').rstrip('.')} (strict: {ours.answer}, paper: {other.answer})"
+        f"{_claim_text(ours)} (strict: {ours.answer}, paper: {other.answer})"
         for ours, other in find_parting_claims(findings, by_paper)
     ]
-    others = f"By the paper's definitions others would be: {'; '.join(parts)}." if parts else ""
-    yield f"The suite strict decides these answers. {others or 'By the definitions of the paper each claim has the same.'}"
+    others = f"differ for: {'; '.join(parts)}" if parts else "give the same answers"
+    yield f"Strict metrics decide these answers. The paper's definitions {others}."
+
+
+def _claim_text(finding: Finding) -> str:
+    return finding.claim.says.rstrip(".")
 
 
 def _answer_sentence(findings: Sequence[Finding]) -> str:
     claims = [finding for finding in findings if finding.claim.where != "ours"]
-    counts = {word: sum(finding.answer == word for finding in claims) for word in (HOLDS, FAILS, UNRESOLVED, UNMEASURED)}
-    measured = len(claims) - counts[UNMEASURED]
-    if not measured:
-        return f"None of {len(claims)} claims of the paper could be asked of what was graded here."
-    asked = "all" if measured == len(claims) else str(measured)
-    verbs = {HOLDS: ("holds", "hold"), FAILS: ("fails", "fail"), UNRESOLVED: ("is unresolved", "are unresolved")}
-    parts = [f"{counts[word] or 'none'} {verbs[word][counts[word] > 1]}" for word in verbs]
-    text = f"Of {len(claims)} claims of the paper {asked} could be asked here: {', '.join(parts)}."
-    failed = [finding.claim.says.strip("… ").rstrip(".") for finding in claims if finding.answer == FAILS]
-    return text + (f" What fails: {'; '.join(failed)}." if failed else "")
+    tested = [finding for finding in claims if finding.answer != UNMEASURED]
+    if not tested:
+        return f"The scores answer none of the paper's {len(claims)} claims."
+    held, failed = ([finding for finding in tested if finding.answer == answer] for answer in (HOLDS, FAILS))
+    rest = "; the others are unresolved" if len(held) + len(failed) < len(tested) else ""
+    scope = f"All {len(claims)}" if len(tested) == len(claims) else f"{len(tested)} of the {len(claims)}"
+    text = f"{scope} claims of the paper were tested. {len(held) or 'None'} held and {len(failed) or 'none'} failed{rest}."
+    return text + (f" Failed: {'; '.join(map(_claim_text, failed))}." if failed else "")
 
 
-def _gap_sentence(grades: Grades) -> Iterator[str]:
-    reader, parts = Reader(grades), []
+def _gap_sentences(grades: Grades) -> Iterator[str]:
+    reader = Reader(grades)
     for robot in HELD_OUT_ROBOTS if reader.mean_of_seen(HELD_OUT_ROBOTS[0], "lpips") else ():
         try:
             gap = reader.unseen_gap(robot, "lpips")
         except NotMeasuredError:
             continue
         if OTHER_ROBOTS not in gap.doubt:
-            ends = " to ".join(_format_change(end) for end in gap.number.interval(grades.level) if not np.isnan(end))
-            parts.append(f"{_format_change(gap.number.value)} on {ROBOT_TITLES[robot]}" + (f" ({ends})" if ends else ""))
-    if parts:
-        yield f"A model that never saw the robot has another LPIPS on it than models that did: {' and '.join(parts)}."
+            yield (
+                f"On {ROBOT_TITLES[robot]}, LPIPS is {_format_more(gap.number.value)}{_format_ends(gap.number, grades.level)} "
+                "for a model that never saw the robot than for models that did."
+            )
 
 
 def _best_sentences(grades: Grades) -> Iterator[str]:
-    """Sentences on which action representation and which condition on looks help most."""
     for part, base, labels in (("actions", "joints", ACTIONS), ("ladder", "none", LADDER)):
-        found = []
+        parts = []
         for robot in HELD_OUT_ROBOTS:
             gains = {row: _gain(grades, part, row, base, robot) for row in labels if row != base}
             known = {row: gain for row, gain in gains.items() if gain is not None}
             if known:
                 best = max(known, key=lambda row: known[row])
                 label = labels[best].removeprefix("+ ").lower()
-                found.append(f"{label} on {SHORT_ROBOTS[robot]} ({_format_change(known[best])})")
-        if found:
-            yield f"Against {labels[base].lower()}, LPIPS improves most with {' and '.join(found)}."
+                parts.append(f"with {label} on {SHORT_ROBOTS[robot]} ({format_change(known[best])})")
+        if parts:
+            yield f"Compared with {labels[base].lower()}, LPIPS improves most {' and '.join(parts)}."
 
 
 def _adaptation_sentences(grades: Grades) -> Iterator[str]:
     for robot in HELD_OUT_ROBOTS:
-        gain = _gain(grades, "few_shot", f"{robot}-1", f"{robot}-0", robot)
-        loss = _gain(grades, "forgetting", f"{robot}-1", "none", FORGETTING_ROBOT)
-        if gain is not None and loss is not None:
-            yield (
-                f"One demonstration of each task changes LPIPS by {_format_change(-gain)} on {ROBOT_TITLES[robot]}, and by "
-                f"{_format_change(-loss)} on {ROBOT_TITLES[FORGETTING_ROBOT]}, which the model had been trained on."
-            )
-        changes = {}
-        for remedy, title in REMEDIES.items():
-            gain = _gain(grades, "few_shot", f"{robot}-1-{remedy}", f"{robot}-0", robot)
-            loss = _gain(grades, "forgetting", f"{robot}-1-{remedy}", "none", FORGETTING_ROBOT)
+        for remedy, title in {"": "", **REMEDIES}.items():
+            ending = f"-{remedy}" if remedy else ""
+            gain = _gain(grades, "few_shot", f"{robot}-1{ending}", f"{robot}-0", robot)
+            loss = _gain(grades, "forgetting", f"{robot}-1{ending}", "none", FORGETTING_ROBOT)
             if gain is not None and loss is not None:
-                changes[title] = f"by {_format_change(-gain)} and {_format_change(-loss)}"
-        if changes:
-            parts = ", ".join(f"{title} {change}" for title, change in changes.items())
-            yield f"The same demonstrations of {ROBOT_TITLES[robot]} change both, {parts}."
+                yield (
+                    f"Adaptation {title and f'{title} '}to one demonstration of each task changes LPIPS by "
+                    f"{format_change(-gain)} on the target, {ROBOT_TITLES[robot]}, and by {format_change(-loss)} on the "
+                    f"training robot {ROBOT_TITLES[FORGETTING_ROBOT]}."
+                )
 
 
-def _distance_sentence(grades: Grades, distances: Distances) -> Iterator[str]:
-    found = correlate(grades, distances)
-    parts = [
-        f"r = {format_signed(found['lpips', axis].r)} with {axis} distance (p = {found['lpips', axis].p_value:.3f}, "
-        f"{'stable' if found['lpips', axis].stable else 'unstable'} sign)"
-        for axis in AXES
-        if ("lpips", axis) in found
-    ]
-    if parts:
-        yield f"Over the five robots, each held out in turn, LPIPS goes with distance: {'; '.join(parts)}."
+def _distance_sentences(grades: Grades, distances: Distances) -> Iterator[str]:
+    results = correlate(grades, distances)
+    for axis in AXES:
+        if result := results.get(("lpips", axis)):
+            yield (
+                f"Over the five leave-one-out folds, LPIPS correlates with {axis} distance at r = {format_signed(result.r)} "
+                f"(p = {result.p_value:.3f}); its sign is {'stable' if result.stable else 'unstable'}."
+            )
 
 
 def _scaling_sentence(grades: Grades) -> Iterator[str]:
-    """What the largest number of bodies beside the three robots is worth, on each held-out robot and on unseen bodies."""
     rows = [f"scaling_seen_bodies_{count}" for count in BODY_SCALES]
     known = [row for row in rows if _gain(grades, "scaling", row, "scaling_seen", BODIES) is not None]
     if known:
         targets = {**{robot: SHORT_ROBOTS[robot] for robot in HELD_OUT_ROBOTS}, BODIES: "unseen bodies"}
         gains = {name: _gain(grades, "scaling", known[-1], "scaling_seen", robots) for robots, name in targets.items()}
-        parts = [f"{_format_change(-gain)} on {name}" for name, gain in gains.items() if gain is not None]
+        parts = [f"{format_change(-gain)} on {name}" for name, gain in gains.items() if gain is not None]
         count = known[-1].rpartition("_")[2]
-        yield f"Training on {count} bodies beside the three robots changes LPIPS by {', '.join(parts)}."
+        yield f"Adding {count} bodies to the three training robots changes LPIPS by {', '.join(parts)}."
 
 
 def _bodies_sentence(difficulty: OverBodies | None) -> Iterator[str]:
-    """How LPIPS on bodies of the wide family goes with each of the paper's distances, and with the frozen frame's."""
-    if difficulty is None:
-        return
-    errors, parts = difficulty.values, _correlations(difficulty)
-    if parts:
+    parts = _correlations(difficulty) if difficulty else []
+    if difficulty and parts:
+        errors = difficulty.values
         frozen = float(errors["value"].corr(errors["frozen"]))
-        last = "" if np.isnan(frozen) else f", and with that of the frozen first frame at r = {format_signed(frozen)}"
-        yield f"Over {len(errors)} bodies that one model has never seen, its LPIPS correlates {', '.join(parts)}{last}."
+        last = (
+            "" if np.isnan(frozen) else f" Its correlation with LPIPS of the frozen first frame is r = {format_signed(frozen)}."
+        )
+        yield f"On {len(errors)} bodies that one model has never seen, its LPIPS correlates {' and '.join(parts)}.{last}"
 
 
 def _halves_sentence(gaps: OverBodies | None) -> Iterator[str]:
-    """How the gap in LPIPS of bodies that one model saw and another did not goes with each of the paper's distances."""
-    if gaps is None:
-        return
-    shares, parts = gaps.values["value"] / 100, _correlations(gaps)
-    if parts:
+    parts = _correlations(gaps) if gaps else []
+    if gaps and parts:
+        shares = gaps.values["value"] / 100
         yield (
-            f"Over {len(shares)} bodies, a model that never saw the body has another LPIPS on it than one that did: "
-            f"{_format_change(shares.mean())} on average, {_format_change(shares.min())} to {_format_change(shares.max())}. "
-            f"This gap correlates {', '.join(parts)}."
+            f"Over {len(shares)} bodies, LPIPS is {_format_more(shares.mean())} on average for a model that never saw the body "
+            f"than for one that did ({format_change(shares.min())} to {format_change(shares.max())}). "
+            f"This gap correlates {' and '.join(parts)}."
         )
 
 
 def _motion_sentences(motions: Motions | None) -> Iterator[str]:
-    """How each action representation's LPIPS differs in own motion from that in shared motion, on each held-out robot."""
     if motions is None:
         return
     for robot in HELD_OUT_ROBOTS:
         changes = {title: motions.change(action, robot, "lpips") for action, title in ACTIONS.items()}
         parts = [
-            f"{_format_change(change.value)} ({' to '.join(map(_format_change, change.interval()))}) with {title.lower()}"
+            f"{format_change(change.value)}{_format_ends(change)} with {title.lower()}"
             for title, change in changes.items()
             if change
         ]
         if parts:
-            yield f"Where each robot moves in its own way, LPIPS on {ROBOT_TITLES[robot]} differs by {', '.join(parts)}."
+            yield f"From shared to own motion, LPIPS on {ROBOT_TITLES[robot]} changes by {', '.join(parts)}."
 
 
 def _correlations(difficulty: OverBodies) -> list[str]:
-    """Correlations over bodies with each of the paper's distances, in words."""
     return [
         f"with {axis} distance at r = {format_signed(result.r)} ({format_signed(result.low)} to {format_signed(result.high)}, "
-        f"p = {result.p_value:.4f})"
+        f"p = {result.p_value:.3f})"
         for axis, result in difficulty.correlations.items()
         if axis in AXES
     ]
 
 
-def _format_change(share: float) -> str:
-    return f"{100 * share:+z.0f}\u00a0%".replace("-", "−")
+def _format_ends(number: Mean, level: float = LEVEL) -> str:
+    """Text such as ' (+25 % to +30 %)'; '' where there is no interval."""
+    ends = [format_change(end) for end in number.interval(level) if not np.isnan(end)]
+    return f" ({' to '.join(ends)})" if ends else ""
+
+
+def _format_more(share: float) -> str:
+    return f"{format_change(abs(share)).lstrip('+')} {'higher' if share >= 0 else 'lower'}"
 
 
 def _gain(grades: Grades, part: str, row: str, base: str, robot: str) -> float | None:
@@ -248,7 +248,7 @@ def _gain(grades: Grades, part: str, row: str, base: str, robot: str) -> float |
 
 
 def part_notes(builder: Builder, scores: Scores) -> Iterator[str]:
-    """Notes on parts of the paper that were not run, and on what was graded beside the protocol."""
+    """Notes on parts of the paper that were not run, and on variants outside the protocol."""
     absent = [part.replace("_", " ") for part in PAPER_PARTS if not builder.has_results(part)]
     if len(absent) == len(PAPER_PARTS):
         yield "No part of the paper was run in this study."
@@ -256,21 +256,21 @@ def part_notes(builder: Builder, scores: Scores) -> Iterator[str]:
         yield f"Not run in this study: {', '.join(absent)}."
     unknown = set(scores.rows["variant"]) - {variant.name for variants in PARTS.values() for variant in variants} - {""}
     if unknown:
-        yield f"Graded, but in no table of the protocol: {', '.join(sorted(unknown))}."
+        yield f"Graded, but not in the protocol's tables: {', '.join(sorted(unknown))}."
 
 
 def curves_note(scores: Scores) -> list[str]:
     """A note on missing scores by frame; none where they are there."""
     if not scores.curves.empty:
         return []
-    return ["No chart of the error by frame: the file of curves (*.curves.parquet) is missing; evaluate writes it."]
+    return ["The chart of the error by frame needs the file *.curves.parquet, which is missing; evaluate writes it."]
 
 
 def missing_note(missing: pd.DataFrame) -> list[str]:
-    """A note on scores that other models have and one lacks; none where nothing is missing."""
+    """A note on scores that some models lack; none where nothing is missing."""
     if missing.empty:
         return []
     return [
-        f"{len(missing)} scores are missing that other models have; comparisons leave these cells out for all. They are in "
-        f"missing.csv: {describe_scores(missing, 3)}."
+        f"{len(missing)} scores are missing for some models; comparisons leave out these episodes for all models. missing.csv "
+        f"lists them: {describe_scores(missing, 3)}."
     ]

@@ -1,13 +1,11 @@
 """Means of scores for tables and findings, each with its bootstrap draws.
 
-A mean has an address that is the same for our study and for the paper: (part, row, robots, metric), such as
-("actions", "optical_flow", "franka_panda", "lpips"). Parts and rows are named as in `paper.py`; robots are one robot, or
-'seen' for those that a row's model was trained on, pooled.
+A mean has the same address in our study and in the paper: (part, row, robots, metric), such as ("actions", "optical_flow",
+"franka_panda", "lpips"). Parts and rows are named as in `paper.py`; robots are one robot, or 'seen' for the pooled training
+robots.
 
-`StudyGrades` reads a score table: its means vary over bootstrap resamples of each variant's trainings and of the scenes, one
-resample of scenes for all cells, so that whatever is computed of several means stays paired by scene. `PaperGrades` reads the
-printed tables: its means vary over what prints the same. Whoever computes a difference or a ratio does it on all these values
-at once (`xew.statistics.combine`) and looks where they lie.
+The means of `StudyGrades` vary over resamples of training runs and scenes, one resample of scenes for all cells, so differences
+and ratios (`xew.statistics.combine`) are paired by scene. The means of `PaperGrades` vary over all values that print the same.
 """
 
 from collections.abc import Mapping, Sequence
@@ -29,7 +27,6 @@ from xew.statistics import (
     combine,
     describe_floors,
     describe_power,
-    find_powerless,
     find_strata,
     floor_sources,
     largest_floor,
@@ -37,6 +34,7 @@ from xew.statistics import (
     noise_floor,
     pool_trainings,
 )
+from xew.statistics.power import find_powerless
 
 TOGETHER = {
     "few_shot": ("few_shot", "remedies"),
@@ -45,7 +43,7 @@ TOGETHER = {
 }
 """Parts of the protocol that are ours and stand in a part of the paper's."""
 ADAPTED_PARTS = ("few_shot", "forgetting")
-"""Parts that set adapted models beside the one that they start from."""
+"""Parts that compare adapted models with their start."""
 ADAPTED = " adapted"
 """Ending of the name under which a variant's trainings stand that adaptations started from, where it has others as well."""
 SEEN = "seen"
@@ -83,25 +81,25 @@ class Grades(Protocol):
         """
 
     def floor(self, robots: str, metric: str, *rows: tuple[str, str]) -> float:
-        """The metric's noise floor on these robots for some rows, as (part, row); a difference that is no larger says nothing.
+        """The largest noise floor of a metric on these robots for some rows (part, row); NaN if one is not known.
 
-        It is the largest of theirs, each of the truth through the row's codec where that was graded, else of the true video, as
-        without any row; NaN where one is not known.
+        It comes from the truth through the row's codec if that was graded, else from the true video.
         """
 
     def axis(self, name: str) -> np.ndarray:
-        """Mean distance of each robot to the other four, 'appearance' or 'kinematic', in the order of ROBOT_NAMES: [5], or
-        with a row for each of `Mean.values` where it is known to some digits only, or has a spread."""
+        """Mean distance of each robot to the other four, in the order of ROBOT_NAMES: [5], or a row for each of
+        `Mean.values`.
+        """
 
 
 def relative_gain(after: Mean, before: Mean, metric: MetricInfo) -> Mean:
-    """By how much a mean is better than another, of the latter: 0.1 is 10 %; positive is better whatever the metric."""
+    """Relative gain of a mean over another: 0.1 is 10 %; positive is better for every metric."""
     sign = 1 if metric.higher_is_better else -1
     return combine(lambda new, old: sign * (new - old) / np.abs(old), after, before)
 
 
 def relative_loss(after: Mean, before: Mean, metric: MetricInfo) -> Mean:
-    """By how much a mean is worse than another, of the latter; positive is worse whatever the metric."""
+    """Relative loss of a mean against another; positive is worse for every metric."""
     return combine(np.negative, relative_gain(after, before, metric))
 
 
@@ -171,10 +169,9 @@ def _adapted_trainings(trainings: Mapping[str, set[int]]) -> dict[str, set[int]]
 
 
 def _drawn_together(trainings: Mapping[str, set[int]]) -> dict[str, str]:
-    """By adapted variant, the name under which its start's scores stand, where both have the same trainings.
+    """By adapted variant, the name of its start's scores, where both have the same training runs.
 
-    An adaptation is its start trained on, so what one training of the start has of luck its adaptation has too: their trainings
-    are drawn together, and a difference of the two is paired by training.
+    An adaptation continues a training run, so both are drawn together and their difference is paired by run.
     """
     found = {}
     for variant, start in _list_adaptations():
@@ -192,17 +189,15 @@ def pooled(variant: Variant, robots: str) -> tuple[str, ...]:
 
 
 class StudyGrades:
-    """A study's score table with the column `variant`.
+    """Means of a score table with the column `variant`.
 
     Args:
-        rows: columns variant, model, task, seed, robot, metric, value; training where a variant may have several; each cell
-            once.
-        metrics: what the table says of its metrics.
-        axes: mean distances by axis, for correlations; in the order of ROBOT_NAMES.
-        own_distances: these were measured, and are not the paper's.
-        spreads: standard deviation of the mean distances by axis, over which they are drawn as well; none where left out.
+        rows: variant, model, task, seed, robot, metric, value and optionally training; each cell once.
+        metrics: descriptions of the metrics.
+        axes, spreads: mean distances in the order of ROBOT_NAMES by axis, and their standard deviations.
+        own_distances: whether the distances were measured.
         draws: number of bootstrap draws.
-        codecs: conditions of the truth through the codec of each variant, of which its noise floors are.
+        codecs: conditions of the truth through the codec of each variant, for noise floors.
     """
 
     level = LEVEL
@@ -284,7 +279,6 @@ class StudyGrades:
         return adapted if part in ADAPTED_PARTS and adapted in self._trainings else variant.name
 
     def has(self, variant: str) -> bool:
-        """Was anything of a variant graded?"""
         return variant in self._trainings
 
     def count_episodes(self, variant: str, robots: Sequence[str]) -> int:
@@ -292,14 +286,10 @@ class StudyGrades:
         held = [~np.isnan(self._scores(variant, tuple(robots), metric)).all(axis=0) for metric in self.metrics]
         return int(np.logical_or.reduce(held).sum())
 
-    def baseline(self, model: str, robots: Sequence[str], metric: str) -> Mean | None:
-        """Mean of a baseline."""
-        return self.variant_mean(model, tuple(robots), metric)
-
     def variant_mean(self, variant: str, robots: tuple[str, ...], metric: str, shared_part: str = "") -> Mean | None:
         """Mean over all episodes of some robots, or over those that every measured variant of a part has.
 
-        Of a variant with several trainings it is their mean, over the episodes that all of them have.
+        A variant with several training runs has their mean, over the episodes that all of them have.
         """
         key = (variant, robots, metric, shared_part)
         if key not in self._cache:
@@ -339,11 +329,11 @@ class StudyGrades:
 
     def floor(self, robots: str, metric: str, *rows: tuple[str, str]) -> float:
         info, names = self.metrics[metric], pooled(reference(), robots)
-        truth = self.baseline(TRUTH, names, metric)
+        truth = self.variant_mean(TRUTH, names, metric)
         floors = []
         for variant in [find_variant(*row).name for row in rows] or [""]:
             sources = [" ".join(filter(None, source)) for source in floor_sources(variant, self._codecs)]
-            graded = [self.baseline(source, names, metric) for source in sources]
+            graded = [self.variant_mean(source, names, metric) for source in sources]
             known: list[Mean | None] = [mean for mean in graded if mean] or [truth]
             floors += [noise_floor(mean.value if mean else None, info.best, info.estimated) for mean in known]
         return largest_floor(floors)

@@ -1,7 +1,6 @@
-"""A study's means by the suite strict, at the addresses of the paper's metrics.
+"""A study's means by strict metrics, at the addresses of the paper's metrics.
 
-Claims are about metrics of the paper. Asked of `StrictGrades`, each is answered by the metric of the suite strict that stands
-in the place of the paper's, where the score table has one; asked of the means themselves, by the paper's definitions.
+Claims name metrics of the paper. `StrictGrades` answers with the strict metric that replaces each of them, if it was graded.
 """
 
 from collections.abc import Mapping
@@ -14,11 +13,7 @@ from xew.statistics import Mean, strict_metrics
 
 
 class StrictGrades:
-    """The means of a study, by the metrics that decide.
-
-    Args:
-        grades: of both suites.
-    """
+    """The means of a study, by the metrics that decide."""
 
     def __init__(self, grades: Grades) -> None:
         self._grades, self._strict = grades, strict_metrics(grades.metrics)

@@ -1,7 +1,5 @@
-"""A whole study: which steps it takes, what of it is done, what the rest costs, and where it runs.
-
-A step runs when its inputs or its product are no longer what the ledger says. A study that was stopped at any time goes on
-from what is done.
+"""A whole study: its steps, what is done, the cost of the rest, and where it runs. A step runs if its inputs or its product
+differ from the ledger.
 """
 
 __all__ = ["config", "cost", "ledger", "machines", "plan", "processes", "runner", "status"]

@@ -1,8 +1,7 @@
-"""The config of a study: what configs/study_*.yaml hold, and the experiment that each of its variants becomes.
+"""The config of a study, and the experiment of each of its variants.
 
-A study names one experiment (a config of xew.model) and says only what differs: between all its variants and that file
-(`settings`), for what is adapted (`adaptation`, `remedies`) and for other systems (`systems`). Data, folders, split, action
-and conditioning of each variant follow from the protocol.
+A study names one experiment (a config of xew.model) and the differences of all variants (`settings`), of adaptations
+(`adaptation`, `remedies`) and of other systems (`systems`). The rest of each variant follows from the protocol.
 """
 
 import fnmatch
@@ -33,7 +32,6 @@ from xew.protocol import (
 from xew.sim_warp.tasks import get_task
 
 KINDS = ("generate", "latents", "baselines", "train", "adapt", "rollout", "evaluate", "distances", "analyse")
-"""Kinds of steps, in the order of the work."""
 
 _KNOWN_ROBOTS = tuple(
     dict.fromkeys(robot for split in SPLITS.values() for robot in (*split.train_robots, *split.held_out_robots))
@@ -52,12 +50,12 @@ class Machine:
     workers: int = 1
     """Number of steps at once where there is no GPU."""
     gpus_per_training: int = 1
-    """Number of GPUs that a training takes at once."""
+    """Number of GPUs of a training run."""
     steps_per_gpu: int = 1
-    """Number of steps that share a GPU: at most one training, and others, which leave it idle while they read and write.
+    """Number of steps that share a GPU: at most one training run, and others, which leave it idle while they read and write.
     Above 1 memory is allocated as it is needed."""
     train_launcher: str = ""
-    """Launcher put before a training's command, such as srun --nodes=2; the processes it starts join by jax.distributed."""
+    """Launcher of training commands, such as srun --nodes=2; its processes join by jax.distributed."""
     ray: str | None = None
     """Address of a Ray cluster whose machines share this folder: auto, or host:port. Its resources are used instead."""
 
@@ -67,7 +65,6 @@ class Run(Variant):
     """One training of a variant; its name is the variant's, with an ending from the second training on."""
 
     of: str = ""
-    """Name of the variant."""
     seed: int | None = None
     """Seed of the training; that of the experiment where the study names none."""
 
@@ -106,7 +103,7 @@ class Study:
     test_seeds: int = TEST_SEEDS_PER_TASK
     """Number of test seeds of each task."""
     training_seeds: tuple[int, ...] = ()
-    """Seeds of the trainings of every variant, each a training of its own; one, with the experiment's seed, where left out."""
+    """Seeds of every variant's training runs; one run with the experiment's seed where left out."""
     repeated: tuple[str, ...] = ("*",)
     """Patterns: variants whose names match one of them are trained with every one of these seeds, others with the first."""
     settings: Settings = field(default_factory=dict)
@@ -122,7 +119,7 @@ class Study:
     motion: str = SHARED_MOTION
     """Kind of motion of all episodes, one of protocol.MOTIONS."""
     other_motion: Path | None = None
-    """Folder of the same study in the other kind of motion; the report sets action representations of both side by side."""
+    """Folder of the same study in the other kind of motion; the report compares action representations of both."""
     generate: tuple[str, ...] = ()
     """Further arguments of `xew.sim_warp.generate`."""
     evaluate: tuple[str, ...] = ()
@@ -132,13 +129,12 @@ class Study:
     environment: dict[str, str] = field(default_factory=dict)
     """Environment variables set for every step."""
     step_environment: dict[str, dict[str, str]] = field(default_factory=dict)
-    """Environment variables set beside them for the steps of one kind, such as XLA_FLAGS for `train`."""
+    """Further environment variables for the steps of one kind, such as XLA_FLAGS for `train`."""
     machine: Machine = Machine()
     """Devices to run on."""
 
     @property
     def data_folder(self) -> Path:
-        """Folder of the episodes."""
         return self.out / "data"
 
     @property
@@ -166,7 +162,7 @@ class Study:
 
     @property
     def trained_robots(self) -> tuple[str, ...]:
-        """Robots that have training episodes: of the five all, so that parts may be added; bodies that a variant trains on."""
+        """Robots that have training episodes: of the five all, so parts may be added; bodies that a variant trains on."""
         asked = {robot for variant in self.planned_variants for robot in SPLITS[variant.split].train_robots}
         return tuple(robot for robot in self.robot_keys if robot in ROBOT_NAMES or robot in asked)
 
@@ -178,7 +174,6 @@ class Study:
 
     @property
     def task_count(self) -> int:
-        """Number of tasks."""
         return len(self.tasks) or TASK_COUNT
 
     @property
@@ -213,7 +208,6 @@ class Study:
         return named and (variant.start is None or self._is_repeated(variant.start))
 
     def _includes(self, variant: Variant) -> bool:
-        """Whether a variant of a part is one of this study."""
         named = not self.variants or any(fnmatch.fnmatch(variant.name, pattern) for pattern in self.variants)
         robots, split = self.robot_keys, SPLITS[variant.split]
         if variant.target is not None:
@@ -258,7 +252,6 @@ def check_study(study: Study, path: Path) -> None:
 
 
 def _check_names(study: Study, path: Path) -> None:
-    """Raises ConfigError with the first name that does not exist, or that stands twice."""
     for task in study.tasks:
         get_task(task)
     shots, known_shots = tuple(map(str, study.shots)), tuple(map(str, SHOTS))
@@ -275,7 +268,7 @@ def _check_names(study: Study, path: Path) -> None:
             if name not in known:
                 raise ConfigError(f"{path}: unknown {kind} {name!r};{suggestion(name, known)} known: {', '.join(known)}.")
         if len(set(names)) < len(names):
-            raise ConfigError(f"{path}: a {kind} stands twice in {', '.join(names)}; name each once.")
+            raise ConfigError(f"{path}: a {kind} is named twice in {', '.join(names)}; name each once.")
     variants = list(dict.fromkeys(variant.name for part in study.parts for variant in PARTS[part]))
     for field_name, patterns in (("variants", study.variants), ("repeated", study.repeated)):
         for pattern in patterns:

@@ -1,8 +1,7 @@
-"""The cost of a study: time, GPU-hours and disk for every kind of step, before anything starts.
+"""The cost of a study, before anything starts: time, GPU-hours and disk for every kind of step.
 
-`rates.json` has measured rates by the size of the network; `benchmarks/rates.py` writes an entry from a study that was run.
-
-Where steps of a kind are done in this study already, the others of that kind are estimated by how long those took.
+`rates.json` has measured rates by the size of the network; `benchmarks/rates.py` writes an entry from a study. Steps that are
+done correct the estimates of their kind.
 """
 
 import heapq
@@ -22,7 +21,6 @@ from xew.config import merge_settings, parse, read_yaml
 from xew.protocol import BASELINES, ROBOT_NAMES, Variant, training_counts
 
 RATES = Path(__file__).with_name("rates.json")
-"""Measured rates by the size of the network."""
 RECIPE: Settings = {"clip": {"frames": 33}, "model": {"size": "small"}, "train": {"batch": 4, "steps": 7500}}
 """Defaults of xew.model's experiments, which the analysis does not import, as far as costs depend on them."""
 
@@ -32,33 +30,24 @@ class Rates:
     """Measured times [s] and sizes [MB], by network size."""
 
     machine: str
-    """Machine that they were measured on."""
     measured: str
     """Place and date of the measurement."""
     episode_s: float
-    """Time to make one episode."""
     encode_s: float
     """Time to encode one stream of one episode."""
     step_s: float
     """Time of one optimizer step, on the GPUs that a training has."""
     rollout_s: float
-    """Time to predict one episode."""
     grade_s: float
     """Time to grade one video: a predicted episode, or a baseline's."""
     start_s: float
     """Time from the start of a command to its first real work, with compilation."""
     pair_s: float
-    """Time to measure the distance between two robots."""
     episode_mb: float
-    """Size of one episode."""
     stream_mb: float
-    """Size of one encoded stream of one episode."""
     run_mb: float
-    """Size of all checkpoints that a run keeps."""
     rollout_mb: float
-    """Size of one predicted episode."""
     episode_frames: int
-    """Mean number of frames of an episode."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +55,6 @@ class Cost:
     """The cost of one step."""
 
     amount: int
-    """Amount of work, in `unit`."""
     unit: str
     seconds: float
     disk_mb: float = 0.0
@@ -128,10 +116,7 @@ def _count_new_streams(study: Study, variant: Variant, experiment: Settings, enc
 
 
 def count_optimizer_steps(study: Study, variant: Variant, experiment: Settings) -> int:
-    """Number of optimizer steps of a training.
-
-    `train.epochs` are passes over its samples, of which an episode gives as many as it has chunks.
-    """
+    """Number of optimizer steps of a training run; `train.epochs` are passes over the chunks of its episodes."""
     experiment = merge_settings(RECIPE, experiment)
     train, clip = experiment["train"], experiment["clip"]
     if not train.get("epochs"):
@@ -142,7 +127,7 @@ def count_optimizer_steps(study: Study, variant: Variant, experiment: Settings) 
 
 
 def correct_by_ledger(costs: Mapping[str, Cost], steps: Mapping[str, Step], ledger: Ledger) -> dict[str, float]:
-    """Seconds of each step: as the ledger has them of what is done, else the estimate scaled by its error for that kind."""
+    """Seconds of each step: recorded ones if it is done, else the estimate scaled by its error for that kind."""
     noted: dict[str, float] = {}
     for name, step in steps.items():
         record: Mapping[str, Any] = ledger.record(step) if ledger.outcome(name) else {}
@@ -159,14 +144,13 @@ def correct_by_ledger(costs: Mapping[str, Cost], steps: Mapping[str, Step], ledg
 def estimate_wall_seconds(
     steps: Mapping[str, Step], seconds: Mapping[str, float], done: Collection[str], slots: int, steps_per_gpu: int = 1
 ) -> float:
-    """Time to the end, with each step started as soon as it can be, the longest critical path first.
+    """Time to the end if each step starts as soon as it can, the longest critical path first.
 
     Args:
-        steps: of the study.
-        seconds: that each takes.
+        steps, seconds: the study's steps and the time of each.
         done: names of steps that need no time.
-        slots: number of GPUs, or of steps at once where there is none.
-        steps_per_gpu: number of steps that share a slot, one of them a training; 1 where every step has a slot for itself.
+        slots: number of GPUs, or of steps at once without GPUs.
+        steps_per_gpu: number of steps that share a slot, one of them a training run.
     """
     left = {name: {need for need in step.predecessors if need not in done} for name, step in steps.items() if name not in done}
     alone = steps_per_gpu == 1
@@ -189,9 +173,9 @@ def estimate_wall_seconds(
 
 
 def critical_paths(steps: Mapping[str, Step], seconds: Mapping[str, float], own: bool = False) -> dict[str, float]:
-    """Seconds from the start of each step to the end of the study if there were a slot for every step.
+    """Seconds from the start of each step to the end of the study, with a slot for every step.
 
-    With `own` to the end of the step's own variant: without the steps of others, and of a step that serves all, alone.
+    `own` counts only steps of the same variant.
     """
     paths: dict[str, float] = {}
     for step in reversed(sort_steps(steps)):

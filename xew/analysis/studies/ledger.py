@@ -1,10 +1,9 @@
-"""The ledger of a study: a record of each step, and the digests that tell whether record and product still hold.
+"""The ledger of a study: a record of each step, and digests that show whether record and product still match.
 
-<out>/state/<kind>/<variant>.json   key, status (begun, done, failed), outcome, seconds, host
+    <out>/state/<kind>/<variant>.json   key, status (begun, done, failed), outcome, seconds, host
 
-A step is done when its record says so, its key is that of the study as it is now (its inputs and what it was made from), and
-its product still has the outcome that was noted, or has been removed and no step that is left to do needs it. Anything else is
-made again, from where it was left if the key is the same. So data, checkpoints and rollouts of graded variants may be removed.
+A step is done if its record says so, its key matches the study's inputs, and its product has the recorded outcome. A removed
+product counts as done if no step that is left needs it. Other steps run again, and resume if their key is the same.
 """
 
 import hashlib
@@ -27,7 +26,7 @@ from xew.model.runs.layout import RUN_FILES, checkpoint_time, is_run, list_steps
 ROLLOUT_FILES = ("*/*/*/rgb.mkv", "*/*/*/rollout.json")
 """Patterns of the paths of what `xew.model.rollout` writes into its tree."""
 GRADES = ("parquet", "*.parquet", "summary.md", "summary.csv", "pairs.csv", "bundle.json", "cells/*.json", "baselines/*.json")
-"""Patterns of the endings of what `xew.metrics.evaluate` writes beside a score table."""
+"""Patterns of the endings of what `xew.metrics.evaluate` writes next to a score table."""
 
 
 @dataclass(frozen=True)
@@ -112,10 +111,10 @@ class Ledger:
             shutil.copy2(other.log(step), self.log(step))
 
     def begin(self, step: Step) -> bool:
-        """Note that a step is being made; returns whether it goes on from what an earlier try left.
+        """Note that a step starts; returns whether it resumes an earlier attempt.
 
-        What was made from other inputs is removed where the command would take it for its own, and so is a run that was
-        killed before its first checkpoint, perhaps in the middle of writing its config.
+        Products of other inputs are removed if the command would resume them, and so are runs killed before their first
+        checkpoint.
         """
         key = self.key(step)
         goes_on = self.record(step).get("key") == key
@@ -143,7 +142,7 @@ class Ledger:
         return error
 
     def forget(self, step: Step) -> None:
-        """Have a step made anew; of grades, also remove what a command would go on from (`scores/<variant>.*`)."""
+        """Make a step run again; of grades, also remove what the command would resume (`scores/<variant>.*`)."""
         self._path(step).unlink(missing_ok=True)
         if step.kind in ("baselines", "evaluate"):
             remove_written(step.product.parent, [f"{step.product.stem}.{ending}" for ending in GRADES])
@@ -161,14 +160,9 @@ class Ledger:
 
 
 def _remove_product(step: Step, begun: bool) -> None:
-    """Remove the run or the rollouts of a step, and nothing that lies beside them.
+    """Remove the run or the rollouts of a step, and nothing next to them.
 
-    Args:
-        step: whose product it is.
-        begun: whether this study has begun the step before, so that what lies there is its own, however damaged.
-
-    Raises:
-        ConfigError: the folder of a run holds none, or something cannot be removed.
+    Raises ConfigError if the folder of a run that this study never began holds something else, or a file cannot be removed.
     """
     run = step.kind in ("train", "adapt")
     if run and not begun and step.product.is_dir() and any(step.product.iterdir()) and not is_run(step.product):
@@ -185,7 +179,6 @@ def digest_product(kind: str, product: Path) -> str | None:
 
 
 def _digest_episodes(data: Path) -> str | None:
-    """Digest of the hashes of all accepted episodes."""
     if not data.is_dir():
         return None
     try:

@@ -1,7 +1,5 @@
-"""Machines that the steps of a study run on: the GPUs (or cores) of this one, or a Ray cluster.
-
-Both start the same commands as processes of their own, with their output in the same logs. A cluster's machines must see the
-study's folder at the same path.
+"""Machines for the steps of a study: the GPUs (or cores) of this one, or a Ray cluster that sees the study's folder at the
+same path.
 """
 
 import logging
@@ -97,7 +95,6 @@ class ThisMachine:
         return len(self._open_slots(step)) >= self._count_slots(step)
 
     def _count_slots(self, step: Step) -> int:
-        """Number of slots that a step takes; without GPUs every step takes one."""
         return max(1, step.gpus_of(self.slots)) if self.gpus else 1
 
     def _open_slots(self, step: Step) -> list[str]:
@@ -186,7 +183,7 @@ class RayCluster:
 
 
 def _run_on_ray(command: tuple[str, ...], log: str, environment: dict[str, str], launcher: tuple[str, ...], folder: str) -> int:
-    """Run a command in a process of its own from the study's working folder; called in a Ray worker."""
+    """Run a command in its own process from the study's working folder; called in a Ray worker."""
     os.chdir(folder)
     os.environ.update(environment)
     process = start_step(command, Path(log), environment, method="spawn", launcher=launcher)

@@ -1,8 +1,7 @@
-"""Pieces of a study that ran in folders of their own, on machines that share no disk, brought together.
+"""Merges pieces of a study that ran in other folders, on machines that share no disk.
 
-A piece is the folder that `xew.analysis.study` has written elsewhere, whole or without what is large: data, latents,
-checkpoints and rollouts need not come along. What a piece has done is taken over with its record, which says from which inputs
-it was made; whether it holds for this study is told by its key, never by times.
+A piece is a folder that `xew.analysis.study` wrote elsewhere; data, latents, checkpoints and rollouts may be missing. Keys,
+never times, decide whether a record holds for this study.
 """
 
 import shutil
@@ -20,18 +19,10 @@ READ_LATER = ("baselines", "evaluate", "distances")
 
 
 def merge_piece(steps: Mapping[str, Step], ledger: Ledger, piece: Path) -> list[str]:
-    """Take over what a piece has done and this study has not.
-
-    Args:
-        steps: of the study, whose products lie in its folder.
-        ledger: of the study.
-        piece: folder of the piece.
-
-    Returns:
-        Names of the steps that were taken over.
+    """Copy the products and records that a piece has and this study lacks; returns the names of these steps.
 
     Raises:
-        ConfigError: the piece is no study, or has another product than its record says.
+        ConfigError: the piece is no study, or a product does not match its record.
     """
     if not (piece / "state").is_dir():
         raise ConfigError(f"{piece} is no folder of a study: it has no state/.")
@@ -56,15 +47,15 @@ def merge_piece(steps: Mapping[str, Step], ledger: Ledger, piece: Path) -> list[
 
 
 def _take_scores_by_video(data: Path, out: Path, piece: Path) -> None:
-    """Copy what a piece has beside its data of the baselines' scores, which a grading that is left to do goes on from."""
+    """Copy a piece's baseline scores next to its data, which later grading resumes from."""
     if data.is_relative_to(out):
-        beside = data.with_name(f"{data.name}-baselines").relative_to(out)
-        if (piece / beside).is_dir():
-            shutil.copytree(piece / beside, out / beside, dirs_exist_ok=True)
+        scores = data.with_name(f"{data.name}-baselines").relative_to(out)
+        if (piece / scores).is_dir():
+            shutil.copytree(piece / scores, out / scores, dirs_exist_ok=True)
 
 
 def _take_product(step: Step, out: Path, piece: Path, outcome: str) -> None:
-    """Copy what a piece has of a step's product, with what lies beside it. Raises ConfigError as `merge_piece`."""
+    """Copy a step's product from a piece, with the files next to it. Raises ConfigError as `merge_piece`."""
     if step.kind in SERVES_ALL:
         return
     source = piece / step.product.relative_to(out)
@@ -73,8 +64,8 @@ def _take_product(step: Step, out: Path, piece: Path, outcome: str) -> None:
         raise ConfigError(f"{source} is not what the records of {piece} say was made; bring the whole piece again.")
     if source.is_dir():
         shutil.copytree(source, step.product, dirs_exist_ok=True, ignore=shutil.ignore_patterns(".*"))
-    name = "*" if step.kind == "distances" else f"{source.stem}.*"  # distances have a folder of their own
-    beside = [path for path in source.parent.glob(name) if path.is_file()]
-    for path in {source, *beside} if source.is_file() else ():
+    name = "*" if step.kind == "distances" else f"{source.stem}.*"  # distances have their own folder
+    siblings = [path for path in source.parent.glob(name) if path.is_file()]
+    for path in {source, *siblings} if source.is_file() else ():
         step.product.parent.mkdir(parents=True, exist_ok=True)
         shutil.copy2(path, step.product.parent / path.name)

@@ -30,25 +30,18 @@ class Step:
     """One command of a study, with what it needs and what it makes."""
 
     kind: str
-    """One of KINDS."""
     variant: str
     """Name of a variant's training (`Run`); empty for a step that serves all."""
     command: tuple[str, ...]
-    """Module and arguments."""
     needs: tuple[str, ...]
-    """Names of the steps before it."""
     inputs: Any
-    """Inputs that its result depends on beside the results of those steps, as plain JSON."""
+    """Inputs of its result besides those steps, as plain JSON."""
     product: Path
-    """File or folder that it makes."""
     gpus: int = 1
-    """Number of GPUs that it takes at once."""
     every_gpu: bool = False
-    """Whether it takes all GPUs of its machine in place of a number."""
+    """Whether it takes all GPUs of its machine instead of a number."""
     launcher: tuple[str, ...] = ()
-    """Program and arguments that start the command, if any."""
     environment: Mapping[str, str] = field(default_factory=dict)
-    """Environment variables of its kind."""
     after: tuple[str, ...] = ()
     """Names of steps that it lets end first, such as one that makes part of the same; its result does not depend on theirs."""
 
@@ -181,9 +174,9 @@ def _plan_rollout(study: Study, variant: Variant, experiment: Settings) -> Step:
 
 
 def _plan_baselines(study: Study, variant: Variant, experiment: Settings) -> Step:
-    """Grading of the baselines, and of the truth through the codec that most variants share, on all test episodes.
+    """Grading of the baselines, and of the truth through the codec of most variants, on all test episodes.
 
-    It keeps processors busy while the first models train; later gradings find what it has graded, and nothing waits for it.
+    It uses processors while the first models train; nothing waits for it.
     """
     out, frames = study.baselines_path, experiment.get("rollout", {}).get("max_frames", 0)
     given = ("--data", str(study.data_folder), "--out", str(out), "--codec", str(_config_path(study, variant)))
@@ -215,7 +208,7 @@ def _plan_evaluate(study: Study, variant: Variant) -> Step:
 
 
 def measured_bodies(study: Study) -> list[str]:
-    """Keys of the bodies whose distances are measured, beside those of the five robots."""
+    """Keys of the bodies whose distances are measured in addition to the five robots."""
     asks = {"bodies", "halves"}.intersection(study.parts)
     return [robot for robot in study.graded_robots if robot in DISTANCE_BODIES] if asks else []
 
@@ -261,10 +254,7 @@ def _training_inputs(experiment: Settings) -> Settings:
 
 @cache
 def source_digest(*rooms: str) -> str:
-    """Digest of all files of some rooms, at any depth.
-
-    Steps that are quickly made again, such as the report, depend on the code. Grading depends on the version of its protocol.
-    """
+    """Digest of all files of some packages: steps that are quick to repeat, such as the report, depend on the code."""
     content = hashlib.sha256()
     for root in map(Path, xew.__path__):
         for path in sorted(path for room in rooms for path in Path(root, room).rglob("*")):

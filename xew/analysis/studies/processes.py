@@ -1,8 +1,7 @@
-"""The process of one step of a study: a command of this package, its output in a log, its end noticed.
+"""The process of one step of a study: a command of this package with its output in a log.
 
-A step's process leaves when the study is killed (training saves first), and waits while one that was left behind still works
-on the same step, so that two never write to the same place. On one machine processes are forked from one that has already
-imported JAX and the model (multiprocessing's forkserver): starting costs a fraction of a second instead of several.
+A process ends when the study is killed (training saves first), and waits while an older one works on the same step. On one
+machine processes are forked from one that has imported JAX and the model, so a start takes a fraction of a second.
 """
 
 import contextlib
@@ -26,7 +25,6 @@ from xew.concurrency import leave_with_parent
 PRELOADED = ("xew.model.train", "xew.model.rollout", "xew.metrics.evaluate")
 """Modules that the fork server imports. None of them may start a thread or a JAX backend at import, which no fork survives."""
 ENDED = "exit status"
-"""Beginning of the last line of a log."""
 
 CONTEXTS: dict[str, ForkServerContext | SpawnContext] = {
     "forkserver": multiprocessing.get_context("forkserver"),
@@ -42,15 +40,15 @@ def start_step(
     launcher: Sequence[str] = (),
     niceness: int = 0,
 ) -> BaseProcess:
-    """Start `python -m command...` as a process of its own; `.exitcode` is the command's.
+    """Start `python -m command...` in a new process; `.exitcode` is the command's.
 
     Args:
         command: module and arguments.
-        log: file that its output is appended to; a lock file of the same name lies beside it.
-        environment: variables set for it beside the study's own.
-        method: forkserver is quick; spawn starts from a fresh interpreter.
-        launcher: a program and its arguments that start the command instead, such as srun.
-        niceness: amount by which others go before it where processors are short.
+        log: file that its output is appended to, with a lock file next to it.
+        environment: additional environment variables.
+        method: forkserver is quick; spawn starts a fresh interpreter.
+        launcher: program and arguments that start the command, such as srun.
+        niceness: increment of the process's niceness.
     """
     if method == "forkserver":
         multiprocessing.set_forkserver_preload(list(PRELOADED))
@@ -92,7 +90,6 @@ def _run(command: tuple[str, ...], log: Path, environment: dict[str, str], launc
 
 
 def _run_module(module: str, *arguments: str) -> int:
-    """Run a module as `python -m` does; returns its exit status."""
     sys.argv[1:] = arguments
     sys.modules.pop(module, None)  # the fork server has imported it under its own name
     try:
@@ -114,7 +111,6 @@ def _cpu_seconds() -> float:
 
 
 def _launch(command: Sequence[str]) -> int:
-    """Run a program, to which SIGTERM is passed on; returns its exit status."""
     process = subprocess.Popen(command)
     signal.signal(signal.SIGTERM, lambda *_: process.terminate())
     return process.wait()

@@ -24,19 +24,15 @@ class StudyRunner:
 
     study: Study
     steps: Mapping[str, Step]
-    """All steps by name."""
     ledger: Ledger
     machines: Machines
     critical_paths: Mapping[str, float]
-    """Seconds from the start of each step to the end of the study."""
     budget: "Budget | None" = None
     """Time after which nothing may run, if there is such a time."""
     only: Collection[str] = ()
-    """Kinds of steps that are begun; all kinds where it is empty."""
     started: dict[str, float] = field(default_factory=dict)
     """Start times of the steps that run [s]."""
     settled: int = 0
-    """Number of steps that are done, failed or blocked."""
     failed: dict[str, str] = field(default_factory=dict)
     """Steps that failed, and steps that could not be made because of them, with the reason."""
 
@@ -82,7 +78,7 @@ class StudyRunner:
         return (not self.only or step.kind in self.only) and (self.budget is None or self.budget.fits(step.name))
 
     def _find_blocker(self, step: Step) -> str:
-        """Why a step cannot be made, or ''. The analysis is of whatever was graded."""
+        """Why a step cannot be made, or ''. The analysis needs no particular step."""
         missing = [name for name in step.needs if name in self.failed]
         if not missing or (step.kind == "analyse" and list_graded_variants(step, self.failed)):
             return ""
@@ -95,7 +91,6 @@ class StudyRunner:
         self.machines.start(step, complete_command(step, goes_on, self.failed), self.ledger.log(step))
 
     def _finish(self, name: str, code: int) -> str:
-        """Note how a step ended; returns its name."""
         step, seconds = self.steps[name], time.monotonic() - self.started.pop(name)
         error = self.ledger.finish(step, code, seconds)
         if self.budget is not None and not error:
@@ -124,15 +119,9 @@ class StudyRunner:
 
 
 class Budget:
-    """Time that a study may take now: what is trained is graded first, and nothing is trained that would not be graded in time.
+    """Time limit of a study: trained models are graded first, and no run starts that could not be graded in time.
 
-    Trainings come in the order of the plan, so what a study names first is had first. Adaptations follow at once on the
-    training that they start from, which another machine would have to repeat.
-
-    Args:
-        study, steps: what is run.
-        ledger: of the study.
-        seconds: time from now.
+    Training runs come in the order of the plan, adaptations directly after the run that they start from.
     """
 
     def __init__(self, study: Study, steps: Mapping[str, Step], ledger: Ledger, seconds: float) -> None:
@@ -154,10 +143,7 @@ class Budget:
         return 0 if finishing else 1 if adapting else 2, self._order[name]
 
     def fits(self, name: str) -> bool:
-        """Whether a step and what follows it up to the grades of the same variant would end in time.
-
-        What is trained is rolled out and graded while there is any time: otherwise the training was for nothing.
-        """
+        """Whether a step and its followers up to the variant's grades would end in time; trained models are always finished."""
         seconds = 0.0 if name.partition("/")[0] in FINISHING else self._seconds[name]
         return time.monotonic() + seconds <= self._end
 

@@ -43,7 +43,7 @@ class Builder:
 
     @property
     def reported(self) -> tuple[str, ...]:
-        """Metrics of the full tables: the paper's suite, and whatever else the scores ask to be shown."""
+        """Metrics of the full tables: the paper's suite, and other reported metrics."""
         return tuple(name for name, info in self.ours.metrics.items() if name in PAPER_METRICS or info.reported)
 
     @cached_property
@@ -71,9 +71,8 @@ class Builder:
         return replace(own, verdict=verdict, parting=parting, published=printed.published, printed=printed.printed)
 
     def _marks(self, part: str, row: str, base: str, robots: str, metric: str) -> tuple[str, str]:
-        """Verdict on the difference from the row `base`, and `TableCell.parting`.
-
-        A metric beside one of the suite strict, which decides, has no verdict, but parting.
+        """Verdict on the difference from the row `base`, and `TableCell.parting`; of a pair only the strict metric has a
+        verdict.
         """
         if not base or base == row:
             return "", ""
@@ -95,7 +94,9 @@ class Builder:
             if name not in (CODEC_TRUTH, TRUTH):
                 graded = self.ours.count_episodes(name, robots) if isinstance(self.ours, StudyGrades) else most
                 label = f"{title} ({graded} of {most} episodes)" if graded < most else title
-                rows.append(TableRow((label,), tuple(self.baseline(name, robots, m) for m in metrics), baseline=True))
+                rows.append(
+                    TableRow((label,), tuple(self.variant_cell(name, tuple(robots), m) for m in metrics), baseline=True)
+                )
         return [*_keep_graded(rows), *self.truth((TRUE,), [(robots, metric) for metric in metrics])]
 
     def _most_episodes(self, robots: Sequence[str]) -> int:
@@ -105,18 +106,15 @@ class Builder:
         return max((self.ours.count_episodes(variant, robots) for variant in self.ours.variants), default=0)
 
     def truth(self, labels: tuple[str, ...], places: Sequence[tuple[Sequence[str], str]]) -> list[TableRow]:
-        """Rows of the true video and of the truth through codecs, which show the noise floors; none that was not graded.
-
-        Args:
-            labels: of the row.
-            places: robots, pooled, and metric of each column.
+        """Rows of the true video and of the truth through codecs, for the robots and metric of each column; empty if not
+        graded.
         """
         rows = {TRUTH: labels}
         for name in self.ours.codec_truths if isinstance(self.ours, StudyGrades) else ():
             title = f"{BASELINES[CODEC_TRUTH]} ({name.partition(' ')[2]})"
             shown = tuple(title if label == TRUE else label for label in labels)
             rows[name] = shown if title in shown else (f"{labels[0]}, {title}", *labels[1:])
-        cells = {name: tuple(self.baseline(name, *place) for place in places) for name in rows}
+        cells = {name: tuple(self.variant_cell(name, tuple(robots), metric) for robots, metric in places) for name in rows}
         return _keep_graded([TableRow(shown, cells[name], baseline=True) for name, shown in rows.items()])
 
     def note(self, part: str, rows: Iterable[tuple[str, str, str]]) -> str:
@@ -144,10 +142,6 @@ class Builder:
         parts = (f"{text[0].upper()}{text[1:]}: {'; '.join(names)}." for text, names in found.items())
         return f"{word}. {' '.join(parts)}"
 
-    def baseline(self, model: str, robots: Sequence[str], metric: str) -> TableCell:
-        """The mean of a baseline on some robots, pooled."""
-        return self.variant_cell(model, tuple(robots), metric)
-
     def variant_cell(self, model: str, robots: tuple[str, ...], metric: str) -> TableCell:
         """The mean of a variant, or of a baseline, on some robots, pooled; without the paper's value."""
         info = self.ours.metrics.get(metric)
@@ -164,7 +158,6 @@ class Builder:
 
 
 def _keep_graded(rows: Sequence[TableRow]) -> list[TableRow]:
-    """Rows with at least one graded cell."""
     return [row for row in rows if any(cell.episodes for cell in row.cells)]
 
 

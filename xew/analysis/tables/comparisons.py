@@ -13,7 +13,7 @@ from xew.protocol import BASELINES, HELD_OUT_ROBOTS, PASTED_RENDER, ROBOT_NAMES,
 from xew.statistics import MIN_SCENES, SIGNIFICANCE, Mean, combine, largest_floor
 
 OTHER_ROBOTS = "measured on other robots: no model that saw this one was graded"
-"""Doubt about a gap that is told from seen robots, which may be easier or harder to render."""
+"""Doubt about a gap measured on other robots, which may be easier or harder to render."""
 FEW_ROBOTS = "five robots: descriptive"
 """Doubt about a correlation that another pairing of distances with scores gives as well."""
 
@@ -29,24 +29,21 @@ class Comparison:
     label: str
     number: Mean
     above: float = -np.inf
-    """Bound that the number has to lie above."""
     below: float = np.inf
-    """Bound that the number has to lie below; with `above` the margins of an equivalence."""
     percent: bool = True
     """Whether it is printed as a percentage, else with three decimals."""
     doubt: str = ""
-    """Reason why it cannot be resolved whatever the interval says, or ''."""
+    """Reason why it is unresolved for any interval, or ''."""
     subject: tuple[str, str, str, str] | None = None
     """Part, row, robot and metric of the model of which something good is said, and which should therefore beat pasting."""
     exact: tuple[float, float] = (0.0, 0.0)
     """Exact p of the claim and of its opposite over pairings of robots, which have to be small too; 0 where none is asked."""
 
     def p_values(self, level: float) -> tuple[float, float]:
-        """The p of the claim and the p of its opposite, each to be compared with SIGNIFICANCE.
+        """The p of the claim and of its opposite, to compare with SIGNIFICANCE.
 
-        Of one bound, both are twice the one-sided p, so that they agree with an interval of level 1 - SIGNIFICANCE. Between two
-        bounds, the claim is an equivalence: the larger p of two one-sided tests, without the factor (Schuirmann 1987, "A
-        comparison of the two one-sided tests procedure and the power approach").
+        For one bound both are twice the one-sided p. Two bounds are an equivalence: the larger p of two one-sided tests
+        (Schuirmann 1987, "A comparison of the two one-sided tests procedure and the power approach").
         """
         sides = [(self.number.p_above, self.above), (self.number.p_below, self.below)]
         asked = [test(bound, level) for test, bound in sides if np.isfinite(bound)]
@@ -67,9 +64,7 @@ class Claim:
     where: str
     """Section of the paper, or 'ours' for a stricter question that it does not answer."""
     says: str
-    """Claim in words."""
     test: str
-    """Test in words."""
     comparisons: Callable[["Reader"], Iterator[Comparison]]
 
 
@@ -91,7 +86,7 @@ class Reader:
     def gain(
         self, part: str, after: str, before: str, robots: str, metric: str, above: float = -np.inf, below: float = np.inf
     ) -> Comparison:
-        """The gain of one row over another, as a share of the value before; positive is better."""
+        """The relative gain of one row over another; positive is better."""
         new, old = self.mean(part, after, robots, metric), self.mean(part, before, robots, metric)
         label = f"{SHORT_ROBOTS.get(robots, 'seen')} {self.title(metric)}"
         # Where a bound from above is asked for, smallness is the claim, and the floor does not speak against it.
@@ -102,10 +97,8 @@ class Reader:
         return Comparison(label, gain, above, below, doubt=doubt, subject=subject)
 
     def over_pasting(self, subject: tuple[str, str, str, str]) -> Comparison:
-        """The gain of a model over the pasted render, which learned nothing, on the same episodes; positive is better.
-
-        Args:
-            subject: part, row, robot and metric.
+        """Gain of a model over the paste baseline on the same episodes, for a part, row, robot and metric; positive is
+        better.
         """
         part, row, robot, metric = subject
         found = self.grades.against(part, row, PASTED_RENDER, robot, metric)
@@ -128,10 +121,9 @@ class Reader:
         return self._seen[robot, metric]
 
     def unseen_gap(self, robot: str, metric: str) -> Comparison:
-        """The loss of the fold that did not see a robot from those that did, on this robot's same episodes; positive is worse.
+        """The relative loss of the fold that did not see a robot against those that did, on the same episodes.
 
-        It is a share of their score. All folds are trained on four robots and have the same conditions. Where they were not
-        graded, it is the loss of the reference model from seen robots, in doubt.
+        Without these folds it is the loss of the reference model against seen robots, in doubt.
         """
         saw, fold = self.mean_of_seen(robot, metric), f"loeo_{robot}"
         if saw is None or self.grades.mean("loeo", fold, robot, metric) is None:
@@ -142,10 +134,10 @@ class Reader:
         return Comparison(label, relative_loss(unseen, saw, self.grades.metrics[metric]), above=0, doubt=doubt)
 
     def worse_than_seen(self, part: str, row: str, robot: str, metric: str, above: float = 0) -> Comparison:
-        """The loss of a row on a robot that it did not see from what it would score had it seen it; positive is worse.
+        """The loss of a row on an unseen robot against its expected score had it seen the robot; positive is worse.
 
-        That is its score on seen robots, times how much harder this robot is than those for the folds that saw each. Where they
-        were not graded, it is its score on seen robots, in doubt.
+        The expectation is its score on seen robots, scaled by the robot's difficulty for the folds that saw it. Without these
+        folds it is the score on seen robots, in doubt.
         """
         new, old = self.mean(part, row, robot, metric), self.mean(part, row, SEEN, metric)
         label = f"{SHORT_ROBOTS[robot]} {self.title(metric)}"
@@ -159,9 +151,8 @@ class Reader:
         return Comparison(label, relative_loss(new, expected, self.grades.metrics[metric]), above, doubt=doubt)
 
     def share(self, start: Mean, after: Mean, end: Mean, metric: str) -> tuple[Mean, str]:
-        """The share of the gap from a start to a better end that is closed, and a doubt about it, or ''.
-
-        Without such a gap there is no share: if the end were worse than the start, a worse score would seem to close it.
+        """The closed share of the gap from a start to a better end, and a doubt about it, or ''; without a gap there is no
+        share.
         """
         sign = 1 if self.grades.metrics[metric].higher_is_better else -1
         gap = combine(lambda new, old: sign * (new - old), end, start)
@@ -172,9 +163,8 @@ class Reader:
     def closed_share(
         self, part: str, after: str, before: str, robot: str, metric: str, goal: tuple[str, str]
     ) -> tuple[Mean, str]:
-        """`share` of the gap that another row closes, from a row to the folds that saw the robot.
-
-        Where they were not graded, it is the gap to the goal (part and row) on seen robots, in doubt.
+        """`share` of the gap between a row and the folds that saw the robot; without them, to a goal on seen robots, in
+        doubt.
         """
         old, new = self.mean(part, before, robot, metric), self.mean(part, after, robot, metric)
         saw = self.mean_of_seen(robot, metric)
@@ -184,14 +174,9 @@ class Reader:
     def correlation(
         self, label: str, metric: str, statistic: Callable[..., np.ndarray], axes: Sequence[str], above: float = 0
     ) -> Comparison:
-        """A statistic of distances and scores over the five folds, with its exact p over all pairings of robots.
+        """A statistic of the five folds, with its exact p over all pairings of robots.
 
-        Args:
-            label: what it is.
-            metric: whose scores.
-            statistic: of the distances on each of `axes` and the scores, all [... 5] float64, to [...].
-            axes: kinds of distance.
-            above: bound of the claim.
+        `statistic` maps the distances on each of `axes` and the scores, all [... 5] float64, to [...].
         """
         means = [self.mean("loeo", f"loeo_{robot}", robot, metric) for robot in ROBOT_NAMES]
         sign = -1 if self.grades.metrics[metric].higher_is_better else 1  # higher is worse

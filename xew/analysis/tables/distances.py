@@ -1,6 +1,6 @@
-"""Tables of distances between robots, and of their correlation with scores, in the paper's layouts.
+"""Tables of distances between robots and of their correlation with scores, in the paper's layouts.
 
-Distances are those that `python -m xew.analysis.distance` wrote; without them the paper's printed ones stand in, and say so.
+Without the files of `python -m xew.analysis.distance` they use the paper's printed distances and say so.
 """
 
 from collections.abc import Mapping, Sequence
@@ -14,7 +14,7 @@ from xew.analysis.correlation import Correlation, dof_correlation, loeo_correlat
 from xew.analysis.paper import AXES, PAPER_TITLES, Paper
 from xew.analysis.statistics.grades import Grades, unseen_gap
 from xew.analysis.tables.labels import PAPER_METRICS, ROBOT_TITLES, SHORT_ROBOTS
-from xew.analysis.tables.table import Column, Table, TableCell, TableRow, TableSection, metric_title
+from xew.analysis.tables.table import Column, Table, TableCell, TableRow, TableSection, format_signed, metric_title
 from xew.config import ConfigError
 from xew.protocol import HELD_OUT_ROBOTS, ROBOT_NAMES
 from xew.statistics import Mean, strict_metrics
@@ -53,11 +53,7 @@ class Distances:
 
 
 def read_distances(folder: Path) -> Distances:
-    """Read the files that python -m xew.analysis.distance wrote.
-
-    Raises:
-        ConfigError: a file is missing, or lacks a column, a robot or one of the paper's two axes.
-    """
+    """Read the files of python -m xew.analysis.distance. Raises ConfigError if a file, column, robot or axis is missing."""
     frames = []
     for name, columns in (("distances", ["axis", "robot", "other"]), ("robots", ["robot", "feature"])):
         path = folder / f"{name}.csv"
@@ -67,20 +63,20 @@ def read_distances(folder: Path) -> Distances:
             raise ConfigError(f"cannot read {path} ({error}); make it: {COMMAND.format(folder=folder)}") from error
         missing = [column for column in (*columns, "value", "spread", "published") if column not in frames[-1]]
         if missing:
-            raise ConfigError(f"{path} has no column {', '.join(missing)}; make it anew: {COMMAND.format(folder=folder)}")
+            raise ConfigError(f"{path} has no column {', '.join(missing)}; make it again: {COMMAND.format(folder=folder)}")
     found = Distances(frames[0], frames[1], measured=True)
     for feature in (*AXES, *FEATURE_TITLES):
         lacking = [robot for robot, value in zip(ROBOT_NAMES, found.of(feature), strict=True) if np.isnan(value)]
         if lacking:
             raise ConfigError(
-                f"{folder / 'robots.csv'} has no {feature} of {', '.join(lacking)}; make it anew with all five robots: "
+                f"{folder / 'robots.csv'} has no {feature} of {', '.join(lacking)}; make it again with all five robots: "
                 f"{COMMAND.format(folder=folder)}"
             )
     return found
 
 
 def printed_distances(paper: Paper) -> Distances:
-    """The paper's figures in place of measured ones."""
+    """The paper's printed distances."""
     features = (*FEATURE_TITLES, *AXES)
     robots = [(robot, name, getattr(paper.robots[robot], name)) for name in features for robot in ROBOT_NAMES]
     names = list(paper.robots)
@@ -133,12 +129,12 @@ def distance_tables(distances: Distances) -> list[Table]:
 
 def correlation_table(grades: Grades, distances: Distances, paper: Paper) -> Table:
     """The paper's table: r and leave-one-out range for each of its axes, then r with the number of joints."""
-    found = correlate(grades, distances)
+    results = correlate(grades, distances)
 
     def row(metric: str) -> TableRow:
         cells = []
         for axis in AXES:
-            result, printed = found.get((metric, axis)), getattr(paper.metrics[metric], axis)
+            result, printed = results.get((metric, axis)), getattr(paper.metrics[metric], axis)
             cells += [
                 _signed_cell([result.r] if result else [], [printed.r]),
                 _signed_cell([result.low, result.high] if result else [], [printed.low, printed.high]),
@@ -154,7 +150,7 @@ def correlation_table(grades: Grades, distances: Distances, paper: Paper) -> Tab
         "correlations",
         "Correlation of distance with scores",
         "r of each robot's mean distance with its score when it was held out, and its range when one robot is left out. "
-        f"Positive: farther is worse. LPIPS is the paper's primary outcome, all else exploratory."
+        f"Positive: farther is worse. LPIPS is the paper's primary outcome; all others are exploratory."
         f"{_note_printed_distances(distances)}",
         ("metric",),
         (*columns, Column("DoF r")),
@@ -164,20 +160,14 @@ def correlation_table(grades: Grades, distances: Distances, paper: Paper) -> Tab
 
 def own_correlation_tables(grades: Grades, distances: Distances) -> list[Table]:
     """The same table for distances that the paper does not have; none where none were measured."""
-    found = correlate(grades, distances)
+    results = correlate(grades, distances)
     own = [axis for axis in distances.axes if axis not in AXES]
     shown = [metric for metric in PAPER_METRICS if metric in grades.metrics]
 
     def row(metric: str) -> TableRow:
         cells: list[TableCell] = []
         for axis in own:
-            result = found.get((metric, axis))
-            p = TableCell(f"{result.p_value:.3f}", value=result.p_value) if result else TableCell()
-            cells += [
-                _signed_cell([result.r] if result else [], []),
-                _signed_cell([result.low, result.high] if result else [], []),
-                p,
-            ]
+            cells += _correlation_cells(results.get((metric, axis)))
         return TableRow((PAPER_TITLES[metric],), tuple(cells))
 
     table = Table(
@@ -199,31 +189,23 @@ def unseen_gaps(grades: Grades, metric: str) -> list[Mean] | None:
 
 
 def gap_correlation_tables(grades: Grades, distances: Distances) -> list[Table]:
-    """The gap of each robot in the metrics that decide, and whether it goes with distance; none without all five folds.
-
-    A robot's score when it was held out also tells how hard it is to render for a model that knows it. The gap does not.
-    """
+    """The gap of each robot in the metrics that decide, and its correlation with distance; none without all five folds."""
     deciding = dict.fromkeys(strict_metrics(grades.metrics).get(name, name) for name in PAPER_METRICS if name in grades.metrics)
     found = {metric: gaps for metric in deciding if (gaps := unseen_gaps(grades, metric)) is not None}
 
     def row(metric: str, gaps: Sequence[Mean]) -> TableRow:
         cells = [_percent_cell(gap, grades.level) for gap in gaps]
         for axis in AXES:
-            result = loeo_correlation(distances.of(axis).tolist(), [gap.value for gap in gaps])
-            cells += [
-                _signed_cell([result.r], []),
-                _signed_cell([result.low, result.high], []),
-                TableCell(f"{result.p_value:.3f}", value=result.p_value),
-            ]
+            cells += _correlation_cells(loeo_correlation(distances.of(axis).tolist(), [gap.value for gap in gaps]))
         return TableRow((metric_title(grades.metrics[metric]),), tuple(cells))
 
     heads = ("Pearson r", "leave one out", "p")
     table = Table(
         "gap_correlations",
-        "The gap of each robot, and whether it goes with distance",
-        "Gap: by how much the fold that never saw a robot is worse on it than the four folds that did, of their mean, on the "
-        "same episodes; what makes a robot hard for every model cancels. r of distance with the gap, its range when one robot "
-        "is left out, and the exact two-sided p over all 120 pairings. Ours, and exploratory: the claims are about scores."
+        "The gap of each robot, and its correlation with distance",
+        "Gap: loss of the fold that never saw a robot against the mean of the four folds that did, on the same episodes. r of "
+        "distance with the gap, its range when one robot is left out, and the exact two-sided p over all 120 pairings. Ours, "
+        "and exploratory: the claims are about scores."
         f"{_note_printed_distances(distances)}",
         ("metric",),
         (
@@ -237,12 +219,12 @@ def gap_correlation_tables(grades: Grades, distances: Distances) -> list[Table]:
 
 def certainty_table(grades: Grades, distances: Distances, paper: Paper) -> Table:
     """Table of what five points can say: exact p, Spearman, bootstrap over robots, stability of the sign."""
-    found = correlate(grades, distances)
+    results = correlate(grades, distances)
 
     def row(metric: str) -> TableRow:
         cells: list[TableCell] = []
         for axis in AXES:
-            result, printed = found.get((metric, axis)), getattr(paper.metrics[metric], axis).p_value
+            result, printed = results.get((metric, axis)), getattr(paper.metrics[metric], axis).p_value
             p = TableCell(published=f"{printed:.3f}" if printed else "", printed=printed or np.nan)
             if result is None:
                 cells += [p, TableCell(), TableCell(), TableCell()]
@@ -260,18 +242,13 @@ def certainty_table(grades: Grades, distances: Distances, paper: Paper) -> Table
     heads = ("exact p", "Spearman ρ", "bootstrap of r", "sign")
     return Table(
         "certainty",
-        "How certain that is",
+        "Certainty of these correlations",
         "p is two-sided over all 120 pairings; ρ and the 95 % bootstrap over robots are ours; the sign is stable where it "
         f"survives leaving out any one robot.{_note_printed_distances(distances)}",
         ("metric",),
         tuple(Column(head, AXIS_TITLES[axis]) for axis in AXES for head in heads),
         (TableSection("", tuple(row(metric) for metric in shown), _note_missing_folds(grades, shown)),),
     )
-
-
-def format_signed(value: float) -> str:
-    """Text such as '+0.812'."""
-    return f"{value:+z.3f}".replace("-", "−")
 
 
 def _loeo_scores(grades: Grades, metric: str) -> list[float] | None:
@@ -310,8 +287,15 @@ def _signed_cell(ours: Sequence[float], printed: Sequence[float]) -> TableCell:
     )
 
 
+def _correlation_cells(result: Correlation | None) -> list[TableCell]:
+    """Cells of r, its leave-one-out range and p."""
+    if result is None:
+        return [TableCell()] * 3
+    p = TableCell(f"{result.p_value:.3f}", value=result.p_value)
+    return [_signed_cell([result.r], []), _signed_cell([result.low, result.high], []), p]
+
+
 def _percent_cell(mean: Mean, level: float) -> TableCell:
-    """A cell of a share in percent with its interval."""
     low, high = mean.interval(level)
     text, *ends = (f"{100 * number:+.0f}".replace("-", "−") for number in (mean.value, low, high))
     return TableCell(f"{text} %", "" if np.isnan(low) else " to ".join(ends), value=mean.value, low=low, high=high)

@@ -1,10 +1,8 @@
-"""The answers to claims: each claim's inequalities, asked of the numbers of a study or of the paper.
+"""The answers to claims, for a study or for the paper's printed figures.
 
-Every comparison has two p-values, of what is claimed and of its opposite, each corrected by Holm's method for the comparisons
-of its claim. A claim holds where all of its comparisons do, it fails where the opposite of one is significant, and it is
-unresolved in between: also where a difference is inside the noise floor, where a share is asked of a gap that may not be there,
-where five robots are too few, or where there are fewer than MIN_SCENES scenes. A second answer counts all claims as one family,
-by Holm's method once more. Asked of the paper's own figures, p is 0 or 1: whether all that prints the same lies on one side.
+Every comparison has two p-values, of the claim and of its opposite, corrected by Holm's method within the claim. A claim holds
+if all its comparisons hold, fails if one opposite is significant, and is unresolved otherwise or where there is a doubt (noise
+floor, no gap, five robots, few scenes). A second answer corrects for all claims. For printed figures p is 0 or 1.
 """
 
 from collections.abc import Sequence
@@ -16,10 +14,10 @@ import pandas as pd
 from xew.analysis.statistics.grades import Grades
 from xew.analysis.tables.claims import CLAIMS
 from xew.analysis.tables.comparisons import Claim, Comparison, NotMeasuredError, Reader
+from xew.analysis.tables.table import format_plain, format_share
 from xew.statistics import SIGNIFICANCE, holm
 
 HOLDS, FAILS, UNRESOLVED, UNMEASURED = "holds", "fails", "unresolved", "not measured"
-"""The answers to a claim."""
 BEATS = {HOLDS: "beats pasting", FAILS: "does not beat pasting", UNRESOLVED: "unresolved against pasting"}
 BEATS[UNMEASURED] = "pasting was not graded"
 """Texts of the answers to whether what a claim speaks of beats the pasted render: worse by one comparison is “does not”."""
@@ -36,11 +34,9 @@ class AnsweredComparison:
     low: float
     high: float
     answer: str
-    """One of HOLDS, FAILS and UNRESOLVED."""
     p_holds: float = np.nan
     """p of what is claimed, corrected for the comparisons of the claim; 1 where there is a doubt."""
     p_fails: float = np.nan
-    """p of the opposite."""
     trainings: int = 0
     """Least number of trainings that it rests on; 0 where none is known (the paper)."""
 
@@ -56,11 +52,8 @@ class Finding:
 
     claim: Claim
     answer: str
-    """One of HOLDS, FAILS, UNRESOLVED and UNMEASURED."""
     comparisons: tuple[AnsweredComparison, ...]
-    """Comparisons of the claim; empty where something was not measured."""
     missing: str = ""
-    """Name of what was not measured, if anything."""
     in_family: str = UNMEASURED
     """Answer where all claims that were measured count as one family of tests."""
     over_pasting: tuple[AnsweredComparison, ...] = ()
@@ -81,9 +74,9 @@ class Finding:
 
     @property
     def basis(self) -> str:
-        """Text that says whose result it is: 'of this training', or of how many; '' for the paper."""
+        """Text such as '2 training runs', which the result rests on; '' for the paper."""
         least = min((one.trainings for one in self.comparisons if one.trainings), default=0)
-        return "" if not least else "of this training" if least == 1 else f"of {least} trainings"
+        return "" if not least else "one training run" if least == 1 else f"{least} training runs"
 
     def span(self) -> str:
         """Text with the smallest and the largest number."""
@@ -127,7 +120,6 @@ def _ask_pasting(asked: Sequence[Comparison], reader: Reader) -> tuple[tuple[Ans
 
 
 def _answer_all(asked: Sequence[Comparison], level: float) -> tuple[AnsweredComparison, ...]:
-    """The answers to comparisons that are one family."""
     p_values = np.array([comparison.p_values(level) for comparison in asked])
     claims, opposites = holm(p_values[:, 0]), holm(p_values[:, 1])
     return tuple(_answer_comparison(*each, level) for each in zip(asked, claims, opposites, strict=True))
@@ -148,7 +140,7 @@ def _answer_comparison(comparison: Comparison, p_holds: float, p_fails: float, l
     value, (low, high) = number.value, number.interval(level)
     if comparison.doubt:
         p_holds = p_fails = 1.0
-    show = _format_share if comparison.percent else _format_plain
+    show = format_share if comparison.percent else format_plain
     ends = "" if low == high or np.isnan(low) else f" [{show(low)}, {show(high)}]"
     numbers, answer = f"{show(value)}{ends}{doubt}", _answer(p_holds, p_fails)
     return AnsweredComparison(
@@ -156,22 +148,12 @@ def _answer_comparison(comparison: Comparison, p_holds: float, p_fails: float, l
     )
 
 
-def _format_share(value: float) -> str:
-    digits = 1 if abs(value) < 0.0995 else 0
-    return f"{100 * value:z.{digits}f}\u00a0%".replace("-", "−")
-
-
-def _format_plain(value: float) -> str:
-    return f"{value:z.3f}".replace("-", "−")
-
-
 def findings_frame(findings: Sequence[Finding], of: str) -> pd.DataFrame:
     """A tidy frame of claims, one row per comparison.
 
     Columns: of claim where says test verdict verdict_in_family pasting comparison value low high answer p_holds p_fails
-    trainings. `verdict` is the answer to the claim, `verdict_in_family` that where all claims are one family, `answer` that of
-    the comparison with its corrected p-values; `pasting` says whether what the claim speaks of beats the pasted render, and its
-    gains over that are comparisons “over pasting: …”; `of` says whose numbers they are.
+    trainings. `verdict` answers the claim, `verdict_in_family` the claim among all, `answer` the comparison; `of` names the
+    source.
     """
     columns = ["of", "claim", "where", "says", "test", "verdict", "verdict_in_family", "pasting", "comparison", "value", "low"]
     columns += ["high", "answer", "p_holds", "p_fails", "trainings"]

@@ -126,11 +126,7 @@ def _escape(text: str) -> str:
 
 
 def table_frame(table: Table) -> pd.DataFrame:
-    """A tidy frame, one row per cell: table block note row column text value low high verdict parting paper episodes.
-
-    `block` is the title of the section, `note` says what it lacks, `parting` is the verdict by the paper's definition where
-    that of the suite strict is another one.
-    """
+    """A tidy frame, one row per cell: table block note row column text value low high verdict parting paper episodes."""
     columns = column_heads(table)[len(table.stubs) :]
     return pd.DataFrame(
         {
@@ -162,10 +158,10 @@ def tables_frame(tables: Sequence[Table]) -> pd.DataFrame:
 def findings_markdown(findings: Sequence[Finding], papers: Sequence[Finding] = (), by_paper: Sequence[Finding] = ()) -> str:
     """A Markdown table of claims: test, both answers with numbers, and where given the answers by the paper's definitions and
     on the paper's own figures."""
-    beside = _answers_beside({"by the paper's definitions": by_paper, "the paper's own figures": papers}, len(findings))
-    heads = ["claim", "test", "verdict", "among all claims", "pasted render", "numbers", *beside[0]]
+    columns = _other_answers({"by the paper's definitions": by_paper, "the paper's own figures": papers}, len(findings))
+    heads = ["claim", "test", "verdict", "among all claims", "pasted render", "numbers", *columns[0]]
     lines = [_markdown_line(heads), "|---" * len(heads) + "|"]
-    for finding, last in zip(findings, beside[1:], strict=True):
+    for finding, last in zip(findings, columns[1:], strict=True):
         numbers = "; ".join(one.text for one in finding.comparisons) or f"missing: {finding.missing}"
         claim, basis = finding.claim, f" ({finding.basis})" if finding.basis else ""
         cells = [f"{claim.says} ({claim.where})", claim.test, f"**{finding.answer}**{basis}", finding.in_family]
@@ -174,7 +170,7 @@ def findings_markdown(findings: Sequence[Finding], papers: Sequence[Finding] = (
     return "\n".join(lines)
 
 
-def _answers_beside(others: Mapping[str, Sequence[Finding]], count: int) -> list[list[str]]:
+def _other_answers(others: Mapping[str, Sequence[Finding]], count: int) -> list[list[str]]:
     """Heads, and then answers to each of so many claims, of other sources that are given."""
     given = {title: found for title, found in others.items() if found}
     return [list(given), *([found[i].answer for found in given.values()] for i in range(count))]
@@ -182,19 +178,19 @@ def _answers_beside(others: Mapping[str, Sequence[Finding]], count: int) -> list
 
 def findings_latex(findings: Sequence[Finding], papers: Sequence[Finding] = (), by_paper: Sequence[Finding] = ()) -> str:
     """A LaTeX table of claims: test, both answers, and where given those by the paper's definitions and on its figures."""
-    beside = _answers_beside({"by paper's": by_paper, "paper": papers}, len(findings))
+    columns = _other_answers({"by paper's": by_paper, "paper": papers}, len(findings))
     rows = [
         _latex_line([_escape(text) for text in (finding.claim.says, finding.claim.test, *_both_answers(finding), *last)])
-        for finding, last in zip(findings, beside[1:], strict=True)
+        for finding, last in zip(findings, columns[1:], strict=True)
     ]
     return "\n".join(
         [
             r"% \usepackage{booktabs,amssymb}",
             r"\begin{table*}[t]",
             r"\centering\footnotesize",
-            rf"\begin{{tabular}}{{@{{}}p{{0.32\textwidth}}p{{0.32\textwidth}}lll{'l' * len(beside[0])}@{{}}}}",
+            rf"\begin{{tabular}}{{@{{}}p{{0.32\textwidth}}p{{0.32\textwidth}}lll{'l' * len(columns[0])}@{{}}}}",
             r"\toprule",
-            _latex_line(["claim", "test", "verdict", "among all", "pasting", *beside[0]]),
+            _latex_line(["claim", "test", "verdict", "among all", "pasting", *columns[0]]),
             r"\midrule",
             *rows,
             r"\bottomrule",
@@ -215,4 +211,4 @@ def _findings_caption(findings: Sequence[Finding]) -> str:
     """Text that says what corrections are made, and whose results these are."""
     bases = ", ".join(dict.fromkeys(finding.basis for finding in findings if finding.basis))
     text = "p-values are corrected by Holm's method for the comparisons of a claim, and once more for all claims."
-    return f"{text} Results are {bases}." if bases else text
+    return f"{text} Results rest on {bases}." if bases else text

@@ -1,6 +1,6 @@
-"""Titles and labels of what tables and charts show: metrics of the paper, robots, conditions, systems, remedies.
+"""Titles and labels in tables and charts: metrics of the paper, robots, conditions, systems, remedies.
 
-They live on the entries of the registries. What a registry does not hold is shown under its key.
+They come from the registries; a name that no registry has is shown as it is.
 """
 
 from xew.analysis.paper import PAPER_TITLES
@@ -11,21 +11,17 @@ from xew.protocol import HELD_OUT_ROBOTS, PARTS, SEEN_ROBOTS
 from xew.sim_warp.robots import ROBOTS
 
 PAPER_METRICS = tuple(PAPER_TITLES)
-"""Metrics of the paper's suite, in its order."""
 ROBOT_TITLES = {key: robot.title for key, robot in ROBOTS.items()}
-"""Title of each robot by its key."""
 SHORT_ROBOTS = {key: robot.label for key, robot in ROBOTS.items()}
-"""Label of each robot by its key."""
-SEEN_TITLE = "Seen pool: {}, {} and {}".format(*(ROBOTS[robot].title.partition(" with ")[0] for robot in SEEN_ROBOTS))
-"""Title of what is pooled over the robots that the fixed split trains on."""
+SEEN_TITLE = "Seen robots, pooled: {}, {} and {}".format(*(ROBOT_TITLES[robot] for robot in SEEN_ROBOTS))
+"""Title of means over the robots that the fixed split trains on."""
 HELD_OUT_TITLES = {robot: f"Held-out {ROBOTS[robot].title}" for robot in HELD_OUT_ROBOTS}
-"""Title of each robot that the fixed split holds out."""
 GROUP_TITLES = {SEEN: SEEN_TITLE, **HELD_OUT_TITLES}
-"""Titles of the robots that tables of the fixed split grade together, by their names in addresses."""
+"""Titles of the groups of robots in tables of the fixed split, by their names in addresses."""
 
 
 def robot_title(robot: str) -> str:
-    """Title of a robot; the key of one that no registry holds."""
+    """Title of a robot; the key of an unregistered one."""
     return ROBOT_TITLES.get(robot, robot)
 
 
@@ -35,30 +31,26 @@ def action_title(key: str) -> str:
 
 
 def condition_label(key: str) -> str:
-    """Label of a condition on the robot's looks, as a step of the ladder."""
+    """Label of a condition on the robot's appearance, as a step of the ladder."""
     return CONDITIONS[key].label if key in CONDITIONS else spell_key(key)
 
 
 def spell_key(key: str) -> str:
-    """A key as words, for what no registry holds."""
+    """A key as words."""
     return key.replace("_", " ")
 
 
 ACTIONS = {variant.action: action_title(variant.action) for variant in PARTS["actions"]}
-"""Title of each action representation by its key."""
 LADDER = {variant.embodiment: condition_label(variant.embodiment) for variant in PARTS["ladder"]}
-"""Label of each condition of the ladder by its key, from nothing to a render of every frame."""
+"""Label of each condition of the ladder by its key, from no condition to a render of every frame."""
 SYSTEMS = {
     variant.system: "reference model" if variant.system == REFERENCE else action_title(variant.action)
     for variant in PARTS["baselines"]
 }
-"""Title of each world model by its key."""
 SYSTEM_ACTIONS = tuple(
     REPRESENTATIONS[variant.action].label if variant.action in REPRESENTATIONS else spell_key(variant.action)
     for variant in PARTS["baselines"]
 )
-"""Labels of the actions that each of SYSTEMS gets."""
 TRUE = "true video, graded"
-"""Labels of the rows of both baselines."""
+"""Label of the row of the true video."""
 REMEDIES = {"replay": "with replay", "lora": "with LoRA"}
-"""Label of each remedy against forgetting, by its key."""

@@ -1,7 +1,5 @@
-"""A study's tables in the paper's layouts.
+"""A study's tables in the paper's layouts, with the paper's values; held-out robots are never averaged.
 
-Our value stands large, the paper's value beside it where it prints one. A row that was not run says so, a section that has
-fewer episodes than the protocol asks for says how many, and robots that were held out are never averaged.
 To add a table: a function of a `Builder`, and its name in `build_tables`.
 """
 
@@ -59,7 +57,7 @@ def _keep_measured(builder: Builder, names: Sequence[str]) -> tuple[str, ...]:
 
 
 def gap_table(builder: Builder) -> Table:
-    """Not in the paper as such: the reference model, flow only, on robots seen and unseen, beside both baselines."""
+    """The reference model, flow only, on seen and unseen robots, with both baselines (ours)."""
     keys = {"fixed": "flow only"}
     return _full_table(builder, "gap", "The gap: robots seen and unseen", "fixed", "model", keys, "")
 
@@ -77,7 +75,7 @@ def action_table(builder: Builder) -> Table:
     return Table(
         "actions",
         "Action representation, robots never seen",
-        "Each robot by itself; bold is best for that robot. Marks: against joint pose.",
+        "Bold is best for each robot. Marks: compared with joint pose.",
         ("action representation", "target"),
         metric_columns(builder.ours.metrics, metrics),
         (section,),
@@ -96,8 +94,8 @@ def ladder_table(builder: Builder) -> Table:
     metrics = _keep_measured(builder, ("mask_iou", "region_lpips", "lpips"))
     return Table(
         "ladder",
-        "What the model is told of the robot's looks",
-        "Optical flow throughout. Marks: against flow only.",
+        "Conditioning on the robot's appearance",
+        "All rows use optical flow. Marks: compared with flow only.",
         ("conditioning",),
         tuple(Column(metric_title(builder.ours.metrics[name])) for name in metrics),
         tuple(
@@ -114,18 +112,18 @@ def ladder_full(builder: Builder) -> Table:
 def few_shot_table(builder: Builder) -> Table:
     """The paper's main few-shot table: metrics down, demonstrations across."""
     metrics = _keep_measured(builder, ("mask_iou", "region_lpips", "lpips"))
-    graded = any(builder.baseline(TRUTH, (robot,), metric).episodes for robot in HELD_OUT_ROBOTS for metric in metrics)
+    graded = any(builder.variant_cell(TRUTH, (robot,), metric).episodes for robot in HELD_OUT_ROBOTS for metric in metrics)
 
     def row(robot: str, metric: str) -> TableRow:
         cells = [builder.cell("few_shot", f"{robot}-{shots}", robot, metric, f"{robot}-0") for shots in (0, *SHOTS)]
         cells.append(builder.cell("few_shot", "robot_render", robot, metric))
-        cells += [builder.baseline(TRUTH, (robot,), metric)] * graded
+        cells += [builder.variant_cell(TRUTH, (robot,), metric)] * graded
         return TableRow((SHORT_ROBOTS[robot], metric_title(builder.ours.metrics[metric])), tuple(cells))
 
     return Table(
         "few_shot",
         "Few-shot adaptation",
-        "M demonstrations of each task; M = 0 is the model told nine views, before adaptation. Marks: against M = 0.",
+        "M demonstrations of each task; M = 0 is the model with nine views, before adaptation. Marks: compared with M = 0.",
         ("target", "metric"),
         (
             *(Column(f"M = {shots}", "Demonstrations a task") for shots in (0, *SHOTS)),
@@ -147,7 +145,7 @@ def recovery_full(builder: Builder) -> Table:
     for robot in HELD_OUT_ROBOTS:
         keys = {f"{robot}-{shots}": f"M = {shots}" for shots in (0, *SHOTS)} | _list_remedies(builder, robot, "")
         sections.append(_build_section(builder, HELD_OUT_TITLES[robot], "few_shot", keys, robot, metrics, f"{robot}-0"))
-    caption = "Marks: against M = 0."
+    caption = "Marks: compared with M = 0."
     columns = metric_columns(builder.ours.metrics, metrics)
     return Table(
         "few_shot_full", "Few-shot recovery, all metrics", caption, ("demonstrations a task",), columns, tuple(sections)
@@ -177,7 +175,7 @@ def forgetting_full(builder: Builder) -> Table:
     return Table(
         "forgetting_full",
         f"Forgetting on {ROBOT_TITLES[FORGETTING_ROBOT]}, all metrics",
-        f"The same {ROBOT_TITLES[FORGETTING_ROBOT]} episodes after each adaptation. Marks: against before.",
+        f"The same {ROBOT_TITLES[FORGETTING_ROBOT]} episodes after each adaptation. Marks: compared with before.",
         ("adapted to",),
         metric_columns(builder.ours.metrics, metrics),
         (replace(section, rows=plain),),
@@ -212,7 +210,7 @@ def baseline_table(builder: Builder) -> Table:
         "baselines",
         "Seen and unseen robots under other world models",
         "Bold is best.",
-        ("model", "told of actions"),
+        ("model", "actions"),
         columns,
         (section,),
     )
@@ -227,7 +225,7 @@ def loeo_full(builder: Builder) -> Table:
     return Table(
         "loeo_full",
         "Each robot held out in turn",
-        "Each row is a model of its own, trained on the other four robots; not to be compared with the fixed split.",
+        "Each row is another model, trained on the other four robots; it does not compare with the fixed split.",
         ("held out",),
         metric_columns(builder.ours.metrics, metrics),
         (TableSection("", tuple(rows), note), *([TableSection("True video, graded", tuple(floors))] if floors else [])),
@@ -245,7 +243,7 @@ def count_table(builder: Builder) -> Table:
     return Table(
         "counts",
         "Numbers of scored episodes",
-        f"Of a row of each table; few-shot: {ROBOT_TITLES[FORGETTING_ROBOT]} for forgetting, and the target.",
+        f"Episodes of one row of each table; few-shot: {ROBOT_TITLES[FORGETTING_ROBOT]} for forgetting, and the target.",
         ("experiment",),
         (Column("seen / reference"), *(Column(SHORT_ROBOTS[robot]) for robot in HELD_OUT_ROBOTS)),
         (TableSection("", tuple(rows)),),
@@ -270,10 +268,9 @@ def _count_cell(builder: Builder, part: str, place: int, printed: int) -> TableC
 
 
 def _full_table(builder: Builder, name: str, title: str, part: str, stub: str, keys: dict[str, str], base: str) -> Table:
-    """Ten metrics; the seen pool and each held-out robot a section."""
     metrics = builder.reported
     sections = tuple(_build_section(builder, text, part, keys, robots, metrics, base) for robots, text in GROUP_TITLES.items())
-    caption = f"Marks: against {keys[base].lower()}." if base else ""
+    caption = f"Marks: compared with {keys[base].lower()}." if base else ""
     return Table(name, title, caption, (stub,), metric_columns(builder.ours.metrics, metrics), sections)
 
 

@@ -10,12 +10,7 @@ from xew.protocol import VARIANTS
 
 
 def outside_tables(builder: Builder, rows: pd.DataFrame) -> list[Table]:
-    """One table with a section for each robot, or none where the protocol holds all that was graded.
-
-    Args:
-        builder: of the study.
-        rows: the study's scores; columns variant and robot.
-    """
+    """One table of the scores outside the protocol, a section for each robot; none if there are no such scores."""
     pairs = rows[[VARIANT, "robot"]].drop_duplicates().itertuples(index=False, name=None)
     by_robot: dict[str, list[str]] = {}
     for variant, robot in pairs:
@@ -38,7 +33,7 @@ def outside_tables(builder: Builder, rows: pd.DataFrame) -> list[Table]:
     table = Table(
         "outside",
         "Outside the protocol",
-        "Means of all that the score table holds beside the paper's protocol.",
+        "Means of scores outside the paper's protocol.",
         ("variant",),
         metric_columns(builder.ours.metrics, metrics),
         sections,

@@ -12,10 +12,9 @@ from xew.protocol import (
 from xew.statistics import MIN_SCENES
 
 MARKS = (
-    "▲ better, ▼ worse, ≈ not resolved: the interval of the paired difference holds 0, the difference is inside the noise "
-    f"floor or the floor is not known, or there are fewer than {MIN_SCENES} scenes. A mark in parentheses shows where the "
-    "suites part: it is the verdict by the paper's definition, where that is another than the verdict by the metric of the "
-    "suite strict beside it, which decides"
+    "▲ better, ▼ worse, ≈ not resolved: the interval of the paired difference contains 0, the difference is inside the noise "
+    f"floor, the floor is unknown, or there are fewer than {MIN_SCENES} scenes. A mark in parentheses is the verdict by the "
+    "paper's definition where the strict metric, which decides, has another"
 )
 """Explanation of the marks behind values; captions name the row that a value is compared with."""
 
@@ -28,13 +27,11 @@ class TableCell:
     """Value as text, '–' where nothing was measured."""
     interval: str = ""
     published: str = ""
-    """Paper's value as it is printed."""
     verdict: str = ""
     """Verdict on the difference from the row that the caption names: better, worse or unresolved; '' where there is none."""
     parting: str = ""
     """Verdict by the paper's definition where that of the suite strict, which decides, is another one; else ''."""
     best: bool = False
-    """Whether it is the best of its section's models."""
     value: float = np.nan
     low: float = np.nan
     high: float = np.nan
@@ -48,7 +45,6 @@ class Column:
 
     title: str
     group: str = ""
-    """Title over several columns."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +55,6 @@ class TableRow:
     """Labels, one for each stub of the table."""
     cells: tuple[TableCell, ...]
     baseline: bool = False
-    """Whether no model made it."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +64,6 @@ class TableSection:
     title: str
     rows: tuple[TableRow, ...]
     note: str = ""
-    """Note on what is missing, or ''."""
 
 
 @dataclass(frozen=True)
@@ -77,11 +71,9 @@ class Table:
     """A table as any of the output formats shows it."""
 
     name: str
-    """Name in files and LaTeX labels."""
     title: str
     caption: str
     stubs: tuple[str, ...]
-    """Heads of the columns of labels."""
     columns: tuple[Column, ...]
     sections: tuple[TableSection, ...]
 
@@ -94,12 +86,33 @@ class Table:
 def parting_note(sections: Sequence[TableSection]) -> str:
     """Sentence that explains the marks in parentheses of a table with these sections; '' where it has none."""
     parts = any(cell.parting for section in sections for row in section.rows for cell in row.cells)
-    return "In parentheses: the verdict by the paper's definition, where the suite strict has another." if parts else ""
+    return "In parentheses: the verdict by the paper's definition where the strict metric has another." if parts else ""
 
 
 def format_number(value: float, metric: MetricInfo) -> str:
-    """A value with the digits that mean something: 0.01 dB, 0.1 px, else 0.001."""
+    """A value with its significant digits: 0.01 dB, 0.1 px, else 0.001."""
     return f"{value:.{ {'dB': 2, 'px': 1}.get(metric.unit, 3) }f}"
+
+
+def format_plain(value: float) -> str:
+    """Text such as '−0.812'."""
+    return f"{value:z.3f}".replace("-", "−")
+
+
+def format_signed(value: float) -> str:
+    """Text such as '+0.812'."""
+    return f"{value:+z.3f}".replace("-", "−")
+
+
+def format_share(value: float) -> str:
+    """Text such as '8.5 %' or '31 %'."""
+    digits = 1 if abs(value) < 0.0995 else 0
+    return f"{100 * value:z.{digits}f}\u00a0%".replace("-", "−")
+
+
+def format_change(share: float) -> str:
+    """Text such as '+31 %'."""
+    return f"{100 * share:+z.0f}\u00a0%".replace("-", "−")
 
 
 def metric_title(metric: MetricInfo) -> str:
@@ -115,9 +128,9 @@ def metric_columns(metrics: Mapping[str, MetricInfo], names: Sequence[str]) -> t
 
 
 def format_interval(ends: tuple[float, float], metric: MetricInfo) -> str:
-    """Text such as '0.12–0.15'; '' where there is no interval, or none at these digits."""
-    low, high = ends
-    if np.isnan(low):
+    """Text such as '0.12–0.15', inside the metric's range; '' where there is no interval, or none at these digits."""
+    if np.isnan(ends[0]):
         return ""
-    first, last = format_number(low, metric), format_number(high, metric)
+    low, high = (-np.inf if metric.low is None else metric.low), (np.inf if metric.high is None else metric.high)
+    first, last = (format_number(float(np.clip(end, low, high)), metric) for end in ends)
     return "" if first == last else f"{first}–{last}"

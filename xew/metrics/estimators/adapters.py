@@ -1,7 +1,6 @@
-"""What the adapters of other projects' networks share: packages, checkpoints and queries.
+"""Shared parts of the adapters of other projects' networks: packages, checkpoints and queries.
 
-PyTorch is imported where it is first needed, so that nobody needs it who uses no adapter. Nothing is downloaded, and no file
-is unpickled freely.
+PyTorch is imported on first use. Nothing is downloaded, and no file is unpickled freely.
 """
 
 import importlib
@@ -101,13 +100,9 @@ class PointTracker(ABC):
 
 
 def query_frames(visible: np.ndarray) -> np.ndarray:
-    """The frame at which each point is given to a tracker: int [k], -1 for a point that is never seen.
+    """The frame at which each point is given to a tracker: int [k], -1 for a point that is never visible.
 
-    It is the frame with most visible points, as in the paper; for a point that is hidden there, the one with most visible
-    points among those that show it. The earliest of equals.
-
-    Args:
-        visible: [t k] bool.
+    As in the paper it is the frame with most visible points (of `visible` [t k] bool), among the frames that show the point.
     """
     counts = visible.sum(axis=1)
     frames = np.where(visible, counts[:, None], 0).argmax(axis=0)

@@ -1,10 +1,7 @@
 """CoTracker3 as a tracker, as in the paper: the offline network, run forwards and backwards over a predicted video.
 
-Neither its code nor its weights are here: both are CC-BY-NC 4.0, not for commercial use. Whoever may use them installs the
-package `cotracker` and brings the checkpoint.
-
-The true points start the tracks, so a point is right by definition in its query frame. All points are tracked together and
-influence each other, as the network was made to.
+Code and weights are CC-BY-NC 4.0, not for commercial use, and are not included: install the package `cotracker` and bring the
+checkpoint. The true points start the tracks, so a point is right by definition in its query frame.
 """
 
 import sys

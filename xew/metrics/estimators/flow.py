@@ -1,7 +1,6 @@
-"""Optical flow of video for which there are no exact motion vectors: DIS of OpenCV and RAFT of torchvision.
+"""Optical flow for video without exact motion vectors: DIS of OpenCV and RAFT of torchvision (`backends.open_flow`).
 
-Our own data need neither: the renderer knows every pixel's motion (`rendering.streams`). These are for anybody's video
-(`backends.open_flow`), and tests hold them against the exact vectors.
+Tests validate both against the renderer's exact vectors (`rendering.streams`).
 """
 
 from pathlib import Path
@@ -26,11 +25,8 @@ RAFT_WIDTHS = {64: "raft_large", 32: "raft_small"}
 def dis_flow(start: np.ndarray, end: np.ndarray) -> np.ndarray:
     """Dense inverse search (Kroeger et al. 2016) of OpenCV, medium preset, on gray images.
 
-    Args:
-        start, end: [n h w 3] uint8 RGB, at least 12 pixels a side.
-
-    Returns:
-        [n h w 2] float32, from each pixel of `start` to its place in `end` [pixels, x right, y down].
+    Flow [n h w 2] float32 from each pixel of `start` to its place in `end` [pixels, x right, y down]; both are [n h w 3] uint8
+    RGB of at least 12 pixels a side.
     """
     _check_pairs(start, end)
     if min(start.shape[1:3]) < 12:
@@ -60,18 +56,14 @@ def open_raft(checkpoint: Path) -> "Raft":
 
 
 class Raft:
-    """RAFT on uint8 images; as `dis_flow` in what it takes and gives."""
+    """RAFT on uint8 images, with the arguments and results of `dis_flow`."""
 
     def __init__(self, network: Any) -> None:
         self._network = network
         self._torch = import_torch("RAFT")
 
     def __call__(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-        """Flow [n h w 2] float32 from each pixel of `start` to its place in `end` [pixels, x right, y down].
-
-        Args:
-            start, end: [n h w 3] uint8 RGB.
-        """
+        """Flow [n h w 2] float32 from `start` to `end`, both [n h w 3] uint8 RGB."""
         _check_pairs(start, end)
         blocks = [slice(first, first + RAFT_BATCH) for first in range(0, len(start), RAFT_BATCH)]
         flow = [self._block(start[block], end[block]) for block in blocks]

@@ -1,16 +1,13 @@
-"""The default masker: it finds the robot in a predicted video without any network's weights.
+"""The default masker: robot masks of a predicted video without any network's weights.
 
-Each predicted frame is read with the help of the true episode, whose masks are known. Three kinds of evidence add up, as
-log-likelihood ratios learnt from the true video itself:
-    color      how much more often the robot has this color than everything else has
-    background  how far the pixel is from the empty scene behind it (the camera stands still)
-    shape       a true mask, carried along by optical flow onto the predicted frame: that of the same frame or, where it
-                explains a pixel better, that of the true frame which looks most like the predicted one; where neither does,
-                what was found in the predicted frame before
-Shape counts only where flow explains the pixel (small residual, flow there and back closes), and there it counts for more
-than looks. Without these gates a video that stands still would be given the true masks for nothing; with them it is judged
-by what it shows.
-Its error on true video is published with every score: the row `ground_truth` of `evaluate`.
+Three kinds of evidence, log-likelihood ratios learned from the true episode, add up:
+    color      how much more often the robot has this color than everything else
+    background how far the pixel is from the empty scene behind it (the camera stands still)
+    shape      a true mask, carried by optical flow onto the predicted frame: of the same time or, if it explains a pixel
+        better,
+               of the most similar true frame; else the mask of the predicted frame before
+Shape counts only where flow explains the pixel (small residual, flow there and back closes). Without these gates a frozen video
+would receive the true masks. The row `ground_truth` of `evaluate` gives the masker's error on true video.
 """
 
 import functools
@@ -24,7 +21,6 @@ from xew.metrics.estimators.images import sample, soften
 from xew.metrics.estimators.similarity import find_most_similar
 
 COLOR_BINS = 24
-"""Number of bins for each channel of Lab."""
 BIN_OF_LEVEL = (np.arange(256) * COLOR_BINS // 256).astype(np.uint8)
 """[256] the bin of each level of a channel."""
 LEARNING_FRAMES = 32
@@ -66,7 +62,7 @@ class Appearance:
 
 
 class Episode:
-    """A true episode as predictions of it are compared with it; what is made of a frame is made once for all of them.
+    """A true episode, whose derived arrays are shared by all its predictions.
 
     Args:
         video: [t h w 3] uint8 RGB, the true video.
@@ -123,10 +119,9 @@ def estimate_masks(
 
 
 def learn_appearance(video: np.ndarray, mask: np.ndarray) -> Appearance:
-    """Learn the looks of a robot and its background from true video [t h w 3] uint8 and masks [t h w] bool.
+    """Learn the colors of a robot and its background from true video [t h w 3] uint8 and masks [t h w] bool.
 
-    Colors and differences are learnt from the frames as they are and softened, as predicted video is: else every soft
-    edge of an object would differ from the background as only a robot does.
+    Frames count as they are and softened, because predicted video is soft.
     """
     picked = np.unique(np.linspace(0, len(video) - 1, LEARNING_FRAMES).round().astype(int))
     background, uncovered = _background(video[picked], mask[picked])
@@ -179,15 +174,14 @@ def _looks(appearance: Appearance, frame: np.ndarray) -> np.ndarray:
 
 
 def _choose_better(a: Shape, b: Shape) -> Shape:
-    """At each pixel the shape whose flow explains it better."""
     take = b[0] > a[0]
     return np.where(take, b[0], a[0]), np.where(take, b[1], a[1])
 
 
 def _fill_up(true: Shape, before: Shape) -> Shape:
-    """What true frames leave unexplained, by the predicted frame before: things that the true robot hides are in no true frame.
+    """Shape from the predicted frame before, where true frames explain a pixel less well.
 
-    It has a say only as far as it explains a pixel better, so that its errors do not live on where a true frame knows.
+    It counts only by the difference, so errors do not persist where a true frame explains the pixel.
     """
     rest = np.maximum(before[0] - true[0], 0)
     gate = true[0] + rest
@@ -242,8 +236,7 @@ def _find_carrier(seen: _Frames, t: int, others: _Frames, other: int) -> Carrier
 def _flow(start: np.ndarray, end: np.ndarray) -> np.ndarray:
     """[h w 2] pixels from each pixel of one gray image to its place in the other (DIS).
 
-    The medium preset with a wider stride, fewer iterations and no variational refinement takes half of its time a mask, and
-    masks of a model's, a pasted and another robot's video have the same IoU within .003 (docs/performance.md).
+    This setting halves the time of the medium preset, and IoU of masks stays within 0.003 (docs/performance.md).
     """
     flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     flow.setPatchStride(4)

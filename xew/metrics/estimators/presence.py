@@ -1,8 +1,7 @@
-"""Presence: whether the body of a tracked point is there at all, by those pixels round the point that are the body's own.
+"""Presence: whether a tracked place shows the body of its point, judged by the body's own pixels around the point.
 
-A tracker compares everything round a point. Round a point on an object that a hand holds, most pixels show the hand, so a
-video in which the object is gone looks much like the true one there. Here only pixels of the body are compared, which the
-ground truth tells.
+A tracker compares all pixels around a point. Around a point on a held object most of them show the hand, so a video without the
+object looks much like the true one. Here only pixels of the body count, which the ground truth gives.
 """
 
 import numpy as np
@@ -12,7 +11,7 @@ from xew.metrics.estimators.images import is_inside, sample, soften
 REACH = 8
 """Half the side of the square round a point [pixels] in which pixels of its body are compared."""
 SOFTNESS = 1.5
-"""Standard deviation [pixels] of the blur of what is compared, so that sharpness and grain do not count."""
+"""Standard deviation [pixels] of the blur of what is compared, so sharpness and grain do not count."""
 OTHER_COLOR = 40
 """Least difference [levels of a channel] that is another color, more than shadows and codecs make."""
 SAME_COLOR = 20
@@ -30,20 +29,19 @@ def confirm_tracks(
 ) -> np.ndarray:
     """Tracks without the places that do not show the point's body.
 
-    Compared are the pixels that the body has round the true point with those round the place that was found. It is not the
-    body's if more than half have another color; half leaves room for a body that has turned. Nor is it if more than half show
-    there what the true frame shows there, of something else: then that is what was found.
+    The body's pixels around the true point are compared with those around the tracked place. A place is dropped if more than
+    half have another color, or if more than half show what the true frame has there of another body.
 
     Args:
         tracks: [t k 2] float32 pixels, NaN where lost.
         prediction, target: [t h w 3] uint8, predicted and true video.
-        points: [t k 2] float32 pixels, where the points truly are.
-        visible: [t k] bool, where they are seen.
+        points: [t k 2] float32 pixels, true positions.
+        visible: [t k] bool, where the true points are visible.
         body_id: [t h w] int, the body that a pixel of the target shows.
         body: [k] int, the body that each point lies on.
 
     Returns:
-        [t k 2] float32, NaN where nothing was found or what was found is something else.
+        [t k 2] float32, NaN where lost or dropped.
     """
     confirmed = tracks.copy()
     reach = np.arange(-REACH, REACH + 1)

@@ -1,9 +1,7 @@
-"""SAM 2 as a masker: the true mask of one frame, propagated over a predicted video.
+"""SAM 2 as a masker: the true mask of the frame where the robot is largest, propagated both ways (the paper's protocol).
 
-The paper's protocol: the prompt is the true mask at the frame where the robot is largest, and it is propagated forwards and
-backwards. Each direction starts from a fresh state, because a backward pass in the state of a forward pass reads its
-memories. Two public implementations serve: the package `sam2` with a .pt of the authors, and `transformers` with a folder of
-Hugging Face; which one is used follows from the checkpoint.
+Each direction starts from a fresh state, because a backward pass would read the memories of a forward pass. A .pt of the
+authors needs the package `sam2`, a folder of Hugging Face needs `transformers`.
 """
 
 import contextlib
@@ -24,7 +22,6 @@ MEAN, DEVIATION = np.array([(0.485, 0.456, 0.406), (0.229, 0.224, 0.225)], np.fl
 SIZES = {(96, 12): "t", (96, 16): "s", (112, 24): "b+", (144, 48): "l"}
 """Names of the authors' configs, by the width of the trunk's first layer and the number of its blocks."""
 ROBOT = 1
-"""The one object's number."""
 REPLACING = threading.Lock()
 
 Propagate = Callable[["Frames", int, np.ndarray, bool], dict[int, np.ndarray]]
@@ -156,7 +153,7 @@ def _replace_names(module: Any, names: Mapping[str, Any]) -> Iterator[None]:
 
 def _open_folder(folder: Path) -> Sam2:
     torch = import_torch("SAM 2")
-    install = "pip install transformers; a torchvision beside it must be the one that belongs to the installed torch"
+    install = "pip install transformers; if torchvision is installed, its build must match torch"
     transformers = import_package("transformers.models.sam2_video.modeling_sam2_video", "SAM 2 from a folder", install)
     network = _read_folder(transformers, folder).eval().to(torch_device())
     side = int(network.config.image_size)

@@ -1,7 +1,4 @@
-"""Similarity of frames: the moment of the true video that a predicted frame shows.
-
-Both estimators compare a predicted frame with two true frames: that of the same time, and the one found here.
-"""
+"""Similarity of frames: the moment of the true video that a predicted frame shows."""
 
 import threading
 import weakref
@@ -18,14 +15,15 @@ ROUNDING = 0.01
 
 
 def find_most_similar(prediction: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """For each predicted frame the true frame that looks most like it.
+    """The most similar true frame of each predicted frame.
+
+    The frame of the same time is preferred unless another is clearly more similar.
 
     Args:
         prediction, target: [t h w 3] uint8, predicted and true video of one episode.
 
     Returns:
-        [t] the true frame's index, and [t] the root mean square difference of both as thumbnails, in levels. The frame of
-        the same time is preferred unless another is clearly more alike.
+        [t] index of the true frame, and [t] root mean square difference of both thumbnails, in levels.
     """
     predicted, true = (_thumbnails(video) for video in (prediction, target))
     square = np.sum(predicted**2, axis=1)[:, None] + np.sum(true**2, axis=1) - 2 * predicted @ true.T

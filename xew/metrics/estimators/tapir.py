@@ -1,7 +1,7 @@
 """TAPIR and BootsTAPIR as trackers: the offline networks of DeepMind's `tapnet`, in JAX.
 
-Code and weights are Apache-2.0; neither is here. Whoever uses them installs the package `tapnet` and brings a checkpoint. The
-true points start the tracks, at the frame where most are visible; the network finds them forwards and backwards at once.
+Code and weights are Apache-2.0 and are not included: install the package `tapnet` and bring a checkpoint. The true points start
+the tracks, at the frame where most are visible.
 """
 
 import functools
@@ -21,7 +21,6 @@ from xew.metrics.networks.pickles import read_arrays
 SIDE = 256
 """Side [pixels] of the square for which the networks were trained."""
 CHUNK = 64
-"""Number of points at once."""
 INSTALL = "install it from the sources of github.com/google-deepmind/tapnet, with all that they ask for (it is not on PyPI)"
 TAPIR = {"bilinear_interp_with_depthwise_conv": False, "pyramid_level": 0}
 BOOTSTAPIR = {
@@ -50,8 +49,7 @@ def open_tapir(checkpoint: Path) -> "Tapir":
 
 
 class Tapir(PointTracker):
-    """The tracker: see `xew.metrics.backends.Tracker`. Lost is where the network finds it likelier than not that the point is
-    hidden or that it is off by more than it was trained to tolerate."""
+    """The tracker: see `xew.metrics.backends.Tracker`. Points that are more likely hidden or off than not are lost."""
 
     def __init__(self, network: Any, params: Any, state: Any, options: Mapping[str, Any]) -> None:
         self._weights = jax.device_put((params, state))

@@ -1,6 +1,6 @@
 """The default tracker: it finds the true video's points in a predicted video without any network's weights.
 
-Each predicted frame is read with the help of true frames, in which every point is known, so that nothing drifts: the frame
+Each predicted frame is read with the help of true frames, in which every point is known, so nothing drifts: the frame
 of the same time, and the one that looks most like it, which is another where a model lags, hurries or stands still.
     proposals   optical flow from both true frames, search for the patch of image round a point, and where the predicted
                 video's own flow carries the point from the frame before
@@ -28,15 +28,14 @@ REACHES = np.arange(-PATCH, PATCH + 1, PATCH_STEP, dtype=np.float32)
 OFFSETS = np.stack(np.meshgrid(REACHES, REACHES), axis=-1).reshape(1, -1, 2)
 """Places of these pixels from the point: [r] along one axis, and [1 r*r 2], x and y."""
 SOFTNESS = 1.5
-"""Standard deviation [pixels] of the blur of what is compared, so that sharpness and grain do not count as motion."""
+"""Standard deviation [pixels] of the blur of what is compared, so sharpness and grain do not count as motion."""
 FLATNESS = 10.0
-"""Variance [levels squared] added to those that differences are compared with, so that flat patches are similar."""
+"""Variance [levels squared] added to those that differences are compared with, so flat patches are similar."""
 SURE = 0.9
 """Similarity of a proposal from which on the point is not searched for."""
 REACH = 64
 """Largest distance [pixels] from the true point at which it is searched for, in images of half the size."""
 PEAKS = 4
-"""Largest number of proposals of a search."""
 SPACING = 3
 """Least distance between two of them [pixels of half the size]."""
 REFINEMENT = 4.0
@@ -88,13 +87,9 @@ def estimate_tracks(prediction: np.ndarray, target: np.ndarray, points: np.ndarr
 
 
 class ReferenceTracker:
-    """`estimate_tracks`; what it knows of two videos is computed once while the same arrays follow each other.
-
-    A prediction is asked for several kinds of points, and an episode's true video is compared with several predictions.
-    """
+    """`estimate_tracks`, which keeps what it derives from two videos while the same arrays follow each other."""
 
     pointwise = True
-    """Whether each point is found without regard to the others (`backends.Tracker`)."""
 
     def __init__(self) -> None:
         self._seen: _Video | None = None
@@ -169,9 +164,9 @@ def _track(
 def _propose(
     frame: np.ndarray, gray: np.ndarray, same: _TrueFrame, other: _TrueFrame | None, carried: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Places [k 3 + PEAKS 2] where the points of a frame may be, and their costs [k 3 + PEAKS].
+    """Proposed places [k 3 + PEAKS 2] of the points of a frame, and their costs [k 3 + PEAKS].
 
-    The first three are the flow's from both true frames and the place carried here from the frame before.
+    The first three come from flow from both true frames and from the frame before.
     """
     place = np.full((len(same.points), 3 + PEAKS, 2), np.nan, np.float32)
     cost = np.full(place.shape[:2], GIVEN_UP)
@@ -221,10 +216,9 @@ def _is_in_true_frame(
 
 
 def likeness(image: np.ndarray, places: np.ndarray, true_image: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """[n] how alike the patches round places [n 2] of one image and points [n 2] of another are: 1 equal, 0 unrelated.
+    """[n] similarity of the patches around places [n 2] of one image and points [n 2] of another: 1 equal, 0 unrelated.
 
-    One less the mean squared difference over the sum of both variances; brightness and color count, not contrast alone.
-    Only what lies inside both images is compared; of a place or point far outside the answer says nothing.
+    One minus the mean squared difference over the sum of both variances, over pixels inside both images.
     """
     patch, true_patch = _patches(image, places), _patches(true_image, points)
     shared = _patch_inside(places, image) & _patch_inside(points, true_image)

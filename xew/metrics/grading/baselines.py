@@ -2,8 +2,8 @@
 
 Reads  the episode (xew.metrics.truth), its robot.mkv, and the same scene's episodes of other robots
 
-A model is worth its training where it beats `pasted_render`, which knows what every model knows, the first frame and the
-robot's commands, and learned nothing. To add a baseline, write a function of an episode and one line in BASELINES.
+A model is worth its training if it beats `pasted_render`, the no-learning baseline: it uses only the first frame and the
+robot's commands. To add a baseline, write a function of an episode and one line in BASELINES.
 """
 
 from collections.abc import Callable
@@ -47,17 +47,14 @@ def pasted_render(folder: Path, truth: Truth) -> np.ndarray:
 
 
 def paste_render(first: np.ndarray, render: np.ndarray) -> np.ndarray:
-    """The first frame with its robot filled in and the render of the robot's commands pasted on.
-
-    Every model may be given both. What the arm hid in the first frame is filled in from around by Telea's
-    inpainting (2004).
+    """The first frame with its robot inpainted (Telea 2004) and the render of the robot's commands pasted on it.
 
     Args:
-        first: [h w 3] uint8, the first frame of an episode.
-        render: [t h w 3] uint8, its robot alone on a white ground, from the first frame on.
+        first: [h w 3] uint8, first frame of an episode.
+        render: [t h w 3] uint8, its robot alone on a white ground.
 
     Returns:
-        [t h w 3] uint8, which begins with the first frame as it is.
+        [t h w 3] uint8, which begins with the first frame unchanged.
     """
     disk = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * GROWN + 1, 2 * GROWN + 1))
     hole = cv2.dilate(cv2.bitwise_not(_white_ground(render[0])), disk)
@@ -83,10 +80,7 @@ def other_robot(folder: Path, truth: Truth) -> np.ndarray:
 
 
 def find_other_robot(folder: Path) -> Path | None:
-    """The folder of the next robot by name, in a circle, whose episode of the same scene has its video.
-
-    In shared motion it is as long; in own motion each robot takes its own time.
-    """
+    """The folder of the next robot by name, in a circle, whose episode of the same scene has its video."""
     record = read_record(folder)
     names = sorted(path.name for path in folder.parent.iterdir() if (path / "episode.json").exists())
     place = names.index(folder.name)
@@ -113,4 +107,3 @@ BASELINES: dict[str, Baseline] = {
     OTHER_ROBOT: Baseline(other_robot, _other_digest),
     GROUND_TRUTH: Baseline(lambda folder, truth: truth.rgb),
 }
-"""Baselines by name. The ground truth's scores are the noise floors."""

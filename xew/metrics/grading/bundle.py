@@ -1,9 +1,7 @@
-"""A bundle: one JSON file by which others can check a score table without trusting whoever made it.
+"""A bundle: one JSON file by which others can check a score table.
 
-It holds the protocol, versions and estimators, the digest of the score table, every graded video with the digests of
-the prediction and of the truth and its values, the means over them, and a digest of all this. Checking it needs the bundle
-alone (is it whole, are the means those of its values, is it of the table next to it?), or also the videos and the data
-(was it made from them?).
+It holds protocol, versions, estimators, the digest of the score table, and for every graded video its values and the digests of
+prediction and truth. Alone it shows whether it is whole and consistent; with videos and data, whether it was made from them.
 """
 
 import hashlib
@@ -28,7 +26,6 @@ FORMAT = 1
 DIGESTS = ("prediction", "rgb", "states")
 CHOICES = ("protocol", "estimators", "frame_zero", "allowed")
 MOST_NAMED = 5
-"""Number of differences that a message names."""
 AGREEMENT = 1e-3
 """Largest relative difference (of numbers below 1: absolute) of scores that are graded again on another machine."""
 
@@ -36,14 +33,7 @@ Bundle = dict[str, Any]
 
 
 def write_bundle(path: Path, table: Path, rows: "pd.DataFrame", cells: Sequence[Cell]) -> None:
-    """Write the bundle of a score table.
-
-    Args:
-        path: of the bundle.
-        table: the score table, of which the digest is taken.
-        rows: what is in it.
-        cells: what was graded; those without a row had no value.
-    """
+    """Write the bundle of a score table with these rows; graded cells without a row had no value."""
     values: dict[tuple[Any, ...], dict[str, float]] = defaultdict(dict)
     exact: dict[tuple[Any, ...], int] = {}
     for *key, metric, value, exact_frames in rows[[*KEY, "metric", "value", "exact_frames"]].itertuples(index=False, name=None):
@@ -136,13 +126,7 @@ def _check_types(path: Path, bundle: Any) -> None:
 
 
 def differences(bundle: Bundle, choices: dict[str, Any], cells: Iterable[Cell]) -> list[str]:
-    """What keeps a bundle from being that of these videos and data, one line each; nothing where it is theirs.
-
-    Args:
-        bundle: as read.
-        choices: protocol, estimators, frame_zero and allowed, as they are now.
-        cells: the videos and truths as they are now.
-    """
+    """Differences between a bundle and these videos and choices, one line each; empty if the bundle is made from them."""
     differing = [f"{name} is {bundle[name]!r}, here {choices[name]!r}" for name in CHOICES if bundle[name] != choices[name]]
     here = {cell.key: cell for cell in cells}
     there = {_key(sample): sample for sample in bundle["samples"]}
@@ -166,7 +150,7 @@ def disagreements(bundle: Bundle, key: tuple[Any, ...], values: dict[str, float]
 
 
 def raise_if_any(path: Path, differences: Sequence[str]) -> None:
-    """Raise ConfigError that names the first few differences, if there are any."""
+    """Raise ConfigError with the first few differences, if there are any."""
     if differences:
         more = f"\n  and {len(differences) - MOST_NAMED} more" if len(differences) > MOST_NAMED else ""
         raise ConfigError(f"{path} does not hold here:\n  " + "\n  ".join(differences[:MOST_NAMED]) + more)

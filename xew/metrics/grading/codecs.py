@@ -1,7 +1,7 @@
-"""Codecs of the models that are graded: what is left of true video after a model's codec is the floor of its scores.
+"""Codecs of the graded models: true video through a codec gives the noise floor of its model.
 
-The metrics import nothing of the model: the function that opens a run's codec is named as module:NAME, and it gives a
-`Roundtrip`. The truth through a codec is graded like a prediction, as the baseline CODEC_TRUTH, once a codec and episode.
+The metrics import nothing of the model: OPENER names the function that opens a run's codec. True video through a codec is
+graded like a prediction, as the baseline CODEC_TRUTH, once for each codec and episode.
 """
 
 import hashlib
@@ -62,14 +62,14 @@ def open_codec(run: Path) -> Roundtrip:
 
 
 def open_codecs(runs: Sequence[Path], models: Collection[str] | None = None) -> dict[str, ModelCodec]:
-    """The codecs of runs by the names of the models that they are of.
+    """The codecs of runs by the name of their model.
 
     Args:
         runs: folders of the runs.
-        models: names of all models that are graded; None where codecs may be of others, too.
+        models: names of the graded models; None admits any.
 
     Raises:
-        ConfigError: a run cannot be opened, is of a model that is not graded, or two are of one model.
+        ConfigError: a run cannot be opened or is of a model that is not graded, or two runs are of one model.
     """
     codecs: dict[str, ModelCodec] = {}
     for run in runs:

@@ -1,6 +1,5 @@
-"""Third step of `evaluate`: grade the videos of one episode after another, each by what `open_graders` has opened for it.
-
-A `Group` and what came of grading it can be sent to another process.
+"""Third step of `evaluate`: grade the videos of one episode after another. Groups and results can be sent to other
+processes.
 """
 
 import itertools
@@ -29,7 +28,6 @@ class GroupResult:
     """What came of grading a group, besides the scores in the store."""
 
     errors: Sequence[str]
-    """Messages about videos that could not be graded."""
     has_shapes: bool
     """Whether the shapes of the episode's bodies were known where they were needed."""
 
@@ -48,7 +46,6 @@ class Grader:
     settings: GradingSettings
     resources: ThreadResources
     codecs: Mapping[str, ModelCodec]
-    """Codecs that the truth goes through, by key."""
     stop: threading.Event
     """Signal that no further video is to be begun."""
 
@@ -89,8 +86,7 @@ class Grader:
 
 
 def group_jobs(settings: GradingSettings, jobs: Sequence[Job]) -> list[Group]:
-    """Jobs that are not graded yet, those of one episode together; the episodes with most to grade come first, so that none is
-    begun when all others are nearly done."""
+    """Jobs that are not graded yet, grouped by episode; the largest groups come first, so none starts last."""
     overwrite, store = settings.args.overwrite, settings.store
     wanted = [(job, settings.metrics if overwrite else store.missing(job.cell, settings.metrics)) for job in jobs]
     todo = [(job, names) for job, names in wanted if names]
@@ -101,15 +97,14 @@ def group_jobs(settings: GradingSettings, jobs: Sequence[Job]) -> list[Group]:
 
 
 def collect_results(groups: Sequence[Group], results: Iterable[GroupResult], total: int) -> list[str]:
-    """Show the progress of grading and return what went wrong, one message for each video that could not be graded.
+    """Show progress and return one message for each video that could not be graded.
 
     Args:
-        groups: what is graded.
-        results: what comes of each, in the same order.
-        total: number of all videos, those that were graded before among them.
+        groups, results: the groups and their results, in the same order.
+        total: number of all videos, including those graded before.
 
     Raises:
-        RolloutError: a video cannot be graded, as `Grader` raises it; what was graded before stays in the store.
+        RolloutError: a video cannot be graded, as `Grader` raises it.
     """
     errors: list[str] = []
     without_shapes = []

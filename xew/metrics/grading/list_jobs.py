@@ -36,7 +36,6 @@ class Job:
     """None: the baseline that the cell names as its model."""
     episode: Path
     record: Record
-    """The episode's header."""
 
     @property
     def folder(self) -> Path:
@@ -51,19 +50,17 @@ class Listing:
     jobs: Sequence[Job]
     """Each video once, those of one episode together."""
     codecs: Mapping[str, ModelCodec]
-    """Codecs that the truth goes through, by model."""
     motion: str
-    """Kind of motion of the episodes (`xew.dataset.demand_one_motion`)."""
     errors: Sequence[str]
     """Messages about rollouts that cannot be graded and are left out."""
 
 
 def list_jobs(settings: GradingSettings, baselines: Collection[str] | None = None) -> Listing:
-    """List all videos that are to be graded, and open the codecs that the truth goes through.
+    """List all videos to grade, and open the codecs.
 
     Args:
         settings: of the grading.
-        baselines: keys of BASELINES; all or none, as the settings say, where left out.
+        baselines: keys of BASELINES; as the settings say if None.
 
     Raises:
         EpisodeError: a rollout cannot be graded, unless the settings say to keep going.
@@ -115,7 +112,6 @@ def _list_rollout_jobs(
 
 
 def _jobs(rollout: Rollout, settings: GradingSettings, baselines: Collection[str], codec: ModelCodec | None) -> Iterator[Job]:
-    """The rollout's own job, then its baselines'."""
     episode, record = _find_episode(rollout, settings.args.data)
     frames = rollout.frame_count or record.frame_count
     if not 1 < frames <= record.frame_count:
@@ -135,7 +131,6 @@ def _jobs(rollout: Rollout, settings: GradingSettings, baselines: Collection[str
 
 
 def _baseline_jobs(cell: Cell, episode: Episode, baselines: Collection[str], codecs: Iterable[ModelCodec]) -> Iterator[Job]:
-    """Jobs of baselines, and of the truth through codecs, on the episode and frames of a cell."""
     folder, record = episode
     for name in baselines:
         source = BASELINES[name].source(folder, record)
@@ -179,7 +174,6 @@ def _check_horizons(jobs: Iterable[Job]) -> None:
 
 
 def _find_episode(rollout: Rollout, data: Path) -> Episode:
-    """The episode that a rollout predicts. Raises RolloutError where the data set holds no such episode."""
     folder = episode_folder(data, rollout.task, rollout.seed, rollout.robot)
     if not folder.is_dir():
         raise RolloutError(
@@ -218,23 +212,16 @@ def _find_unique(roots: Sequence[Path], problems: list[str] | None) -> list[Roll
 
 
 def _raise_or_note(problems: list[str] | None, message: str) -> None:
-    """Raise RolloutError, or add to the problems where there is a list of them."""
     if problems is None:
         raise RolloutError(message)
     problems.append(message)
 
 
 def read_prediction(job: Job, truth: Truth, codecs: Mapping[str, ModelCodec], settings: GradingSettings) -> np.ndarray:
-    """The video to grade [t h w 3] uint8, of the truth's shape.
-
-    Args:
-        job: of a rollout or a baseline.
-        truth: of its episode.
-        codecs: by the conditions of the baseline CODEC_TRUTH that name them.
-        settings: say whether the rollout begins with frame 1, and what else is allowed that is an error without.
+    """The video to grade [t h w 3] uint8, of the truth's shape; `codecs` by the conditions of CODEC_TRUTH.
 
     Raises:
-        RolloutError: the video cannot be read, or is not of the truth's shape, and that is not allowed.
+        RolloutError: the video cannot be read, or it has another shape and the settings do not allow that.
     """
     if job.rollout is None and job.cell.model == CODEC_TRUTH:
         return codecs[job.cell.condition].reconstruct(truth.rgb)
@@ -258,10 +245,7 @@ def read_prediction(job: Job, truth: Truth, codecs: Mapping[str, ModelCodec], se
 
 
 def soften_truth(job: Job, truth: Truth) -> np.ndarray | None:
-    """The video [t h w 3] uint8 that estimators see instead of a job's own; None where they see the job's.
-
-    For the ground truth it is the true video softened, whose masks and points are still known.
-    """
+    """Blurred true video [t h w 3] uint8, which estimators see instead of the ground truth; None for other jobs."""
     if job.rollout is not None or job.cell.model != GROUND_TRUTH:
         return None
     return np.stack([cv2.GaussianBlur(frame, (0, 0), SOFTNESS) for frame in truth.rgb])

@@ -1,7 +1,7 @@
-"""Second step of `evaluate`: open what grades videos, in threads of this process or in several processes.
+"""Second step of `evaluate`: open graders, in threads of this process or in several processes.
 
-Threads share compiled programs, and decoding, OpenCV and XLA release Python's lock, so one process keeps about six cores busy.
-Beyond these, and on a GPU, each of several processes grades with one thread.
+Threads share compiled programs, and decoding, OpenCV and XLA release Python's lock: one process keeps about six cores busy.
+With more cores, or a GPU, several processes grade with one thread each.
 """
 
 import functools
@@ -51,14 +51,9 @@ def prepare_process(trust: Sequence[str]) -> None:
 
 
 def grade_groups(settings: GradingSettings, codecs: Mapping[str, ModelCodec], groups: Sequence[Group]) -> Iterator[GroupResult]:
-    """What comes of grading each group, in their order, by as many processes or threads as suit the machine.
+    """Results of all groups in their order, from as many processes or threads as suit the machine.
 
-    They are at most a few groups ahead of each other, so memory does not grow with their number.
-
-    Args:
-        settings: of the grading.
-        codecs: that the truth goes through, by model; other processes open them for themselves.
-        groups: each of one episode.
+    They are at most a few groups ahead of each other, so memory does not grow with the number of groups.
     """
     processes = choose_processes(len(groups), sum(map(len, groups)))
     if processes > 1:
@@ -70,7 +65,7 @@ def grade_groups(settings: GradingSettings, codecs: Mapping[str, ModelCodec], gr
 
 
 def choose_processes(episodes: int, videos: int) -> int:
-    """Number of processes for so many episodes with so many videos: by cores and memory; 1 where threads serve."""
+    """Number of processes for these episodes and videos, by cores and memory; 1 if threads suffice."""
     if asked := os.environ.get(PROCESSES):
         return min(int(asked), episodes)
     cores, gpus = usable_cores(), visible_gpus()
@@ -85,22 +80,12 @@ def choose_processes(episodes: int, videos: int) -> int:
 
 
 def _open_in_process(settings: GradingSettings) -> Grader:
-    """Open a grader in another process."""
     prepare_process(settings.args.trust)
     return open_grader(settings, open_codecs(settings.args.codec), threading.Event())
 
 
 def open_grader(settings: GradingSettings, codecs: Mapping[str, ModelCodec], stop: threading.Event) -> Grader:
-    """Open the estimators that the metrics need.
-
-    Args:
-        settings: of the grading.
-        codecs: that the truth goes through, by model.
-        stop: set when no further video is to be begun.
-
-    Raises:
-        ConfigError: weights are missing.
-    """
+    """Open the estimators that the metrics need; `stop` is set when no further video is to start. Raises ConfigError."""
     args, kinds = settings.args, {input_kind(name) for name in settings.metrics}
     masker: Callable[[], Masker] = _open_nothing
     tracker: Callable[[], Tracker] = _open_nothing
@@ -112,7 +97,6 @@ def open_grader(settings: GradingSettings, codecs: Mapping[str, ModelCodec], sto
 
 
 def _open_nothing() -> Any:
-    """Stand in for an estimator that no metric needs."""
 
     def refuse(*arrays: np.ndarray) -> np.ndarray:
         raise AssertionError("no metric needs this estimator, so none was opened")
@@ -124,7 +108,7 @@ E = TypeVar("E", bound=Callable[..., np.ndarray])
 
 
 def _make_opener(registry: Any, name: str, open_: Callable[[], E]) -> Callable[[], E]:
-    """Make what opens an estimator for a thread: its own, or, where it has weights, that of all threads, used in turn."""
+    """Function that opens an estimator for a thread: a new one, or one shared in turn if it has weights."""
     if pick(registry, name, "estimator").needs is None:
         return open_
     estimator = take_turns(open_())

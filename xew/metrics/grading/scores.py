@@ -5,7 +5,7 @@ scores.curves.parquet  model condition task seed robot metric frame value
 scores.cells/          one small file for each graded video, from which the tables are put together
 <data>-baselines/      the same for the baselines, next to the data set and for all tables
 A metric that a video has no value of has no row. The tables' attributes (pandas `attrs`) hold protocol, versions,
-estimators, what became of frame 0, and each metric's title, unit, direction, range and source, so that the analysis needs no
+estimators, what became of frame 0, and each metric's title, unit, direction, range and source, so the analysis needs no
 import of this package. The tables are a function of what was graded alone: the same bytes whatever was done first, in how
 many threads, and how often it was stopped on the way.
 """
@@ -58,9 +58,7 @@ class Cell:
     prediction: str
     """SHA-256 of the video (`xew.files.digest_files`); '' for a baseline, which is made of the truth."""
     rgb: str
-    """SHA-256 of the true video, as its episode says."""
     states: str
-    """SHA-256 of the true states, as their episode says."""
     settings: str
     """The protocol, the estimators and what else was chosen, as text."""
 
@@ -153,7 +151,7 @@ def path_beside(path: Path, ending: str) -> Path:
 
 
 def write_tables(path: Path, attributes: dict[str, Any], cells: Sequence[Cell], store: CellStore) -> None:
-    """Write both tables of the cells that are graded, sorted, so that the order of work leaves no trace."""
+    """Write both tables of the cells that are graded, sorted, so the order of work leaves no trace."""
     metrics = list(attributes["metrics"])
     # The curves first: what is in the table always has its curves.
     _write_table(path_beside(path, "curves.parquet"), CURVES, _curve_table, attributes, metrics, cells, store)

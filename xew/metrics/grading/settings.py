@@ -34,11 +34,11 @@ class Args:
     masks: str = "default"
     """Estimator of robot masks in a prediction: a name of xew.metrics.backends.MASKERS, or module:NAME."""
     masks_checkpoint: Path | None = None
-    """Its weights, where it has some."""
+    """Checkpoint of this estimator, if it needs one."""
     tracks: str = "default"
     """Estimator of keypoints and objects in a prediction: a name of xew.metrics.backends.TRACKERS, or module:NAME."""
     tracks_checkpoint: Path | None = None
-    """Its weights, where it has some."""
+    """Checkpoint of this estimator, if it needs one."""
     frame_zero: Literal["given", "absent", "predicted"] = "given"
     """given: frame 0 of a video is the frame that the model was given, and is in no score. absent: videos begin with frame 1.
     predicted: frame 0 is scored like the others."""
@@ -46,28 +46,28 @@ class Args:
     """Changes to videos that are errors without it. resize: bring videos of another size to the episode's. trim: cut longer
     videos. rate: take any frame rate of a container, its frames being the episode's one by one."""
     baselines: bool = True
-    """Also grade, as models of their own, the frozen first frame, the robot's render pasted into it, another robot's episode,
+    """Also grade, as separate models, the frozen first frame, the robot's render pasted into it, another robot's episode,
     and the true video itself: the noise floor of the scores."""
     baselines_of: Literal["train", "validation", "test"] | None = None
-    """Instead of rollouts: grade the baselines on all episodes of these seeds, before there is a model."""
+    """Grade the baselines on all episodes of these seeds, without rollouts."""
     max_frames: int = 0
-    """With --baselines-of: number of frames that are graded, for rollouts that are cut to it; 0 for whole episodes."""
+    """With --baselines-of: grade this number of frames; 0 for whole episodes."""
     codec: tuple[Path, ...] = ()
     """Runs of `xew.model.train` that made some of the rollouts: the truth is graded through the codec of each, and is the noise
     floor of its model's scores. Other models have the floor of the true video. With --baselines-of a config of
     `xew.model.train` may be named instead of a run."""
     resample: Literal["scene", "task"] = "scene"
-    """Unit that the summary's intervals resample: scenes (what would other scenes of these tasks give?), or whole tasks."""
+    """Unit that the summary's intervals resample: scenes within tasks, or whole tasks."""
     keep_going: bool = False
-    """Grade the rest when a rollout cannot be graded; the exit status still says so."""
+    """Continue when a rollout cannot be graded; the exit status is still an error."""
     overwrite: bool = False
     """Grade everything again."""
     check: Path | None = None
-    """Grade nothing: check that a bundle is consistent, and, where rollouts are named, that it was made from them."""
+    """Grade nothing; check that a bundle is consistent and, if rollouts are named, that it is made from them."""
     regrade: int = 0
-    """With --check: grade so many of its videos again and compare."""
+    """With --check: grade this number of its videos again and compare."""
     trust: tuple[str, ...] = ()
-    """Modules of your own tasks and robots, such as my_lab.tasks, that the data may name."""
+    """Modules with custom tasks and robots, such as my_lab.tasks, that the data may name."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,6 @@ class GradingSettings:
 
     args: Args
     metrics: tuple[str, ...]
-    """Names of the metrics to grade, in the registry's order."""
     choices: dict[str, Any]
     """All choices that change a score, as they stand in a table's attributes and in the digest of each cell: protocol,
     estimators, frame_zero, allowed."""

@@ -1,7 +1,4 @@
-"""The summary that `evaluate` prints and writes next to its scores, as Markdown.
-
-The ground truth that noise floors are of is graded softened, as any prediction is (`list_jobs.SOFTNESS`).
-"""
+"""The summary that `evaluate` prints and writes next to its scores, as Markdown."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -16,26 +13,25 @@ from xew.statistics import (
     DRAWS,
     LEVEL,
     MIN_SCENES,
-    UNITS,
     Summary,
     describe_parting,
     describe_power,
     find_parting,
     summarize,
 )
+from xew.statistics.bootstrap import UNITS
 
 PAIRS_SHOWN = 6
-"""Largest number of pairs of models in the Markdown summary; where there are more, they stand in the file of pairs alone."""
+"""Largest number of pairs of models in the Markdown summary; more are only in the file of pairs."""
 
 
 def summarize_robots(rows: pd.DataFrame, unit: str = "scene", robots_first: Sequence[str] = ()) -> Summary:
-    """Summarize a score table, each robot by itself.
+    """Summarize a score table robot by robot, `robots_first` before the others.
 
     Args:
-        rows: model condition task seed robot metric value; in the attribute `codecs` the truth through whose codec is the noise
-            floor of which model (`xew.statistics.floor_sources`).
-        unit: what is resampled, a key of UNITS.
-        robots_first: robots that come before the others.
+        rows: model condition task seed robot metric value; attribute `codecs` as in `xew.statistics.floor_sources`.
+        unit: unit to resample, a key of UNITS.
+        robots_first: robots at the top.
     """
     names = {*rows.attrs.get("metrics", ()), *rows["metric"].unique()}
     robots = sorted(rows["robot"].unique(), key=lambda robot: (robot not in robots_first, robot))
@@ -45,15 +41,15 @@ def summarize_robots(rows: pd.DataFrame, unit: str = "scene", robots_first: Sequ
 
 
 def to_markdown(summary: Summary, with_pairs: bool = True) -> str:
-    """For people: a robot after the other, a line per metric, a column per model; then the differences between models."""
+    """Text for people: for each robot a line per metric and a column per model; then the differences between models."""
     lines = [
         "# Scores",
         "",
-        f"Mean over episodes [{LEVEL:.0%} interval; bootstrap, {DRAWS} draws of the {' and '.join(UNITS[summary.unit])}].",
-        f"Fewer than {MIN_SCENES} {summary.unit}s have no interval, and nothing is resolved by them.",
-        "Noise: by how much the estimators miss the metric's best on the true video. ~ marks a mean that cannot be told from",
-        "the true video's; a difference is unresolved where its interval holds 0 or it is no larger than the noise.",
-        "Metrics of the suite strict decide; verdicts of the paper's definitions beside them stand in parentheses.",
+        f"Mean over episodes [{LEVEL:.0%} interval; bootstrap, {DRAWS} draws of {' and '.join(UNITS[summary.unit])}].",
+        f"With fewer than {MIN_SCENES} {summary.unit}s there are no intervals and no verdicts.",
+        "Noise: the estimators' error on the true video. ~ marks a mean that cannot be resolved from the true video's.",
+        "A difference is unresolved if its interval contains 0 or if it is no larger than the noise.",
+        "Strict metrics decide; verdicts by the paper's definitions are in parentheses.",
         *filter(None, [summary.floors, describe_power(summary.power, {})]),
     ]
     for robot, means in summary.means.groupby("robot", sort=False):
@@ -83,29 +79,30 @@ def _mean_lines(means: pd.DataFrame) -> list[str]:
 def _mean_text(row: Any) -> str:
     if row is None:
         return ""
-    interval = "" if math.isnan(row.low) else f" [{row.low:.4g}, {row.high:.4g}]"
+    low, high = (min(max(end, METRICS[row.metric].range[0]), METRICS[row.metric].range[1]) for end in (row.low, row.high))
+    interval = "" if math.isnan(row.low) else f" [{low:.4g}, {high:.4g}]"
     mark = " ~" if row.versus_truth == "unresolved" and interval else ""
     return f"{row.mean:.4g}{interval}{mark}"
 
 
 def _pair_lines(pairs: pd.DataFrame) -> list[str]:
-    """Differences between models and from the frozen first frame; those from the truth stand as marks in the means."""
+    """Differences between models and from the frozen first frame; differences from the truth are marks in the means."""
     pairs = pairs[(pairs["model"] != COPY_FIRST_FRAME) & (pairs["other"] != GROUND_TRUTH)]
     groups = pairs.groupby(["model", "condition", "other", "other_condition"], sort=False)
     if len(groups) > PAIRS_SHOWN:
-        return ["", f"{len(groups)} pairs of models: see the file of pairs."]
+        return ["", f"{len(groups)} pairs of models: see the file *.pairs.csv."]
     lines = []
-    for (model, condition, other, other_condition), found in groups:
+    for (model, condition, other, other_condition), differences in groups:
         names = f"{title((model, condition))} minus {title((other, other_condition))}"
         lines += ["", f"{names}, paired:", "", "| metric | difference | verdict |", "|---|---|---|"]
         row: Any
-        for row in found.itertuples():
+        for row in differences.itertuples():
             interval = "" if math.isnan(row.low) else f" [{row.low:+.4g}, {row.high:+.4g}]"
             word = row.verdict if row.decides else f"({row.verdict})"
             lines.append(f"| {row.metric} | {row.difference:+.4g}{interval} | {word} |")
-        verdicts = dict(zip(found["metric"], found["verdict"], strict=True))
+        verdicts = dict(zip(differences["metric"], differences["verdict"], strict=True))
         if parting := find_parting(verdicts, {metric: METRICS[metric] for metric in verdicts}):
-            lines += ["", f"The suites part on {describe_parting(parting, verdicts)}; strict decides."]
+            lines += ["", f"The suites disagree on {describe_parting(parting, verdicts)}; strict decides."]
     return lines
 
 

@@ -24,7 +24,6 @@ WRITTEN = {
 }
 """Files that are written, by the ending of the name, with what each holds."""
 TABLES = {"summary": "means", "pairs": "pairs", "power": "power"}
-"""Fields of a summary by the name of the table that holds each."""
 
 
 def write_scores(settings: GradingSettings, listing: Listing) -> str:
@@ -40,7 +39,6 @@ def write_scores(settings: GradingSettings, listing: Listing) -> str:
 
 
 def _write_summary(out: Path, rows: pd.DataFrame, resample: str) -> str:
-    """Write the summary's files and return what is printed."""
     if rows.empty:
         return "no scores"
     summary = summarize_robots(rows, resample, HELD_OUT_ROBOTS)

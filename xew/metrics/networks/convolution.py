@@ -55,10 +55,7 @@ def in_float32(x: jax.Array, kernel: jax.Array, stride: int, padding: int) -> ja
 
 
 def in_three_parts(x: jax.Array, kernel: jax.Array, stride: int, padding: int) -> jax.Array:
-    """`convolve` of x [n h w i] and kernel [k k i o], both float32: [n h' w' o] float32.
-
-    It takes three products of numbers that TF32 holds.
-    """
+    """`convolve` of x [n h w i] and kernel [k k i o], both float32, by three TF32 products: [n h' w' o] float32."""
     if stride > 1:
         x, kernel = _in_blocks(x, kernel, stride, padding)
         stride, padding = 1, 0
@@ -86,10 +83,7 @@ def _parts(x: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def _in_blocks(x: jax.Array, kernel: jax.Array, stride: int, padding: int) -> tuple[jax.Array, jax.Array]:
-    """Images and kernel of the same convolution without stride and padding: blocks of pixels lie in the channels.
-
-    Matrix units want many channels, and a first layer has three.
-    """
+    """Images and kernel of the same convolution without stride and padding: blocks of pixels become channels."""
     blocks = -(-len(kernel) // stride)
     sides = [(side + 2 * padding - len(kernel)) // stride + blocks for side in x.shape[1:3]]
     edges = [(padding, stride * count - side - padding, 0) for count, side in zip(sides, x.shape[1:3], strict=True)]

@@ -30,8 +30,8 @@ RIGHT = replace(
 
 SPEC = RobotSpec(
     key="aloha_agilex",
-    title="Aloha-AgileX",
-    label="Aloha",
+    title="ALOHA-AgileX",
+    label="ALOHA",
     urdf=Path(__file__).parent / "descriptions" / "aloha_agilex.urdf",
     arms=(LEFT, RIGHT),
     joint_lower=(-3.14, -0.05, -0.1, -1.6, -1.57, -2.0),

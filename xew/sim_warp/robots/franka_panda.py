@@ -28,7 +28,7 @@ RIGHT = replace(
 
 SPEC = RobotSpec(
     key="franka_panda",
-    title="Franka Panda",
+    title="Franka (Panda)",
     label="Franka",
     urdf=Path(__file__).parent / "descriptions" / "franka_panda.urdf",
     arms=(LEFT, RIGHT),

@@ -29,7 +29,7 @@ RIGHT = replace(
 
 SPEC = RobotSpec(
     key="ur5_wsg",
-    title="UR5 with WSG-50",
+    title="UR5",
     label="UR5",
     urdf=Path(__file__).parent / "descriptions" / "ur5_wsg.urdf",
     arms=(LEFT, RIGHT),

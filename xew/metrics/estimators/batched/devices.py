@@ -1,4 +1,4 @@
-"""The GPU that the batched estimators use, if there is one: Warp's, whatever JAX computes on."""
+"""The GPU of the batched estimators, if there is one: Warp's, whichever device JAX uses."""
 
 from typing import Any
 

@@ -1,8 +1,4 @@
-"""Dense optical flow of many pairs of images at once: OpenCV's dense inverse search as Warp kernels (flow_kernels.py).
-
-Reads  gray images on a device, and which of them are pairs
-Writes flow on the device
-"""
+"""Dense optical flow of many pairs of images at once: OpenCV's dense inverse search as Warp kernels (flow_kernels.py)."""
 
 import functools
 import math
@@ -38,7 +34,6 @@ class Search:
     steps: int
     """Most steps of descent of a patch, half of them on the way there and half on the way back."""
     refinements: int = 0
-    """Number of variational refinements at each level."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +53,6 @@ class Pyramid:
     """Images as the search reads them."""
 
     levels: dict[int, Level]
-    """Levels by their number, from the finest."""
     shape: tuple[int, int]
     """Height and width of the images [pixels]."""
     search: Search

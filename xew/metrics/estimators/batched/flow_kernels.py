@@ -1,6 +1,6 @@
 """Warp kernels of dense inverse search (Kroeger et al. 2016), for many pairs of images at once.
 
-They follow OpenCV's `DISOpticalFlow` with patches of 8 pixels, mean normalization and spatial propagation, so that both give
+They follow OpenCV's `DISOpticalFlow` with patches of 8 pixels, mean normalization and spatial propagation, so both give
 the same flow up to rounding. Its propagation goes from patch to patch within each of eight stripes of rows; patches on a
 diagonal of a stripe do not depend on each other, so a launch does one diagonal of all stripes of all pairs.
 
@@ -22,7 +22,7 @@ ROW = wp.types.vector(length=9, dtype=float)
 STRIPES = wp.constant(8)
 """Number of stripes; flow is not handed on from one to another."""
 GRADIENT = wp.constant(1024)
-"""Number added to a gradient, so that it is packed without its sign."""
+"""Number added to a gradient, so it is packed without its sign."""
 SMALL = wp.constant(0.001)
 """Least determinant of a structure tensor, and what a place keeps away from the last pixel."""
 MOST = wp.constant(1.0e10)
@@ -181,8 +181,8 @@ def invert(tensor: wp.vec3) -> wp.mat22:
     determinant = tensor[0] * tensor[2] - tensor[1] * tensor[1]
     if wp.abs(determinant) < SMALL:
         determinant = SMALL
-    beside = -tensor[1] / determinant
-    return wp.mat22(tensor[2] / determinant, beside, beside, tensor[0] / determinant)
+    off_diagonal = -tensor[1] / determinant
+    return wp.mat22(tensor[2] / determinant, off_diagonal, off_diagonal, tensor[0] / determinant)
 
 
 @wp.kernel

@@ -1,7 +1,4 @@
-"""The default masker (xew.metrics.estimators.masks) on a device: flow, shapes and looks of all frames at once.
-
-Only what needs the mask of the frame before goes frame by frame, four small launches each.
-"""
+"""The default masker (xew.metrics.estimators.masks) on a device: flow, shapes and appearance of all frames at once."""
 
 import functools
 from dataclasses import dataclass
@@ -17,17 +14,12 @@ from xew.metrics.estimators.batched.flow import Array, Search, build_pyramid, fi
 from xew.metrics.estimators.similarity import find_most_similar
 
 SEARCH = Search(finest=1, stride=4, steps=16)
-"""Settings of the flow, those of `masks._flow`."""
 FRAMES_AT_ONCE = {"cpu": 8, "cuda": 128}
 """Number of frames on the device at once; one takes about 10 MB at 320x240."""
 
 
 class BatchedMasker:
-    """`estimate_masks` on a device; an episode is learnt once while predictions of the same one follow each other.
-
-    Args:
-        device: Warp's name of a device, None for Warp's default.
-    """
+    """`estimate_masks` on a device (Warp's name, None for the default), which keeps an episode while it repeats."""
 
     def __init__(self, device: str | None = None) -> None:
         self._device = wp.get_device(device)
@@ -49,7 +41,7 @@ class BatchedMasker:
 
 
 class _Episode:
-    """A true video and its masks as a device has them, with room for a predicted video before them."""
+    """A true video and its masks on a device, with space for a predicted video."""
 
     def __init__(self, target: np.ndarray, mask: np.ndarray, appearance: reference.Appearance) -> None:
         self.target, self.mask = target, mask

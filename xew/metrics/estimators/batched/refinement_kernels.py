@@ -1,6 +1,6 @@
 """Warp kernels of the variational refinement of flow, for many pairs of images at once, as OpenCV has it.
 
-The flow is changed so that colors and their gradients stay the same along it and that it is smooth, all by a robust penalty:
+The flow is changed so colors and their gradients stay the same along it and that it is smooth, all by a robust penalty:
 the system of equations for the change is made a few times (refine_flow in flow.py), and each is solved by relaxation.
 
 Letters of shapes: n images, p pairs, h w an image of one level of the pyramid.
@@ -20,7 +20,7 @@ SMOOTHNESS, COLOR, GRADIENTS = wp.constant(10.0), wp.constant(2.5), wp.constant(
 OVERSHOOT = wp.constant(1.6)
 """Factor of a step of relaxation."""
 ZETA, EPSILON = wp.constant(0.1 * 0.1), wp.constant(0.01 * 0.01)
-"""Added to squared gradients, and to squared errors, so that nothing is divided by zero."""
+"""Added to squared gradients, and to squared errors, so nothing is divided by zero."""
 
 
 @wp.kernel

@@ -33,7 +33,6 @@ ONE = wp.constant(16384)
 PATCH = wp.constant(tracks.PATCH)
 PATCH_STEP = wp.constant(tracks.PATCH_STEP)
 SIDE = wp.constant(2 * tracks.PATCH // tracks.PATCH_STEP + 1)
-"""Number of pixels along a patch's side that are compared."""
 FLATNESS = wp.constant(tracks.FLATNESS)
 REFINEMENT = wp.constant(tracks.REFINEMENT)
 STANDING = wp.constant(tracks.STANDING)

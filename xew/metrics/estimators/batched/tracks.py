@@ -1,8 +1,4 @@
-"""The default tracker (xew.metrics.estimators.tracks) on a device: all points of all frames at once.
-
-Proposals of flow and of search do not depend on the frame before, so they are made for all frames in a few launches; one
-more walks through the frames, a block of threads for each point.
-"""
+"""The default tracker (xew.metrics.estimators.tracks) on a device: all points of all frames at once."""
 
 import functools
 from typing import Any
@@ -33,19 +29,13 @@ _launch = functools.partial(wp.launch, block_dim=THREADS)  # as all launches of 
 
 
 def _launch_blocks(kernel: Any, dim: list[int], inputs: list[Any], outputs: list[Any]) -> None:
-    """Launch a kernel with a block of threads for each index."""
     wp.launch_tiled(kernel, dim=dim, inputs=inputs, outputs=outputs, block_dim=THREADS)
 
 
 class BatchedTracker:
-    """`estimate_tracks` on a device; what it knows of two videos is computed once while the same arrays follow each other.
-
-    Args:
-        device: Warp's name of a device, None for Warp's default.
-    """
+    """`estimate_tracks` on a device (Warp's name, None for the default), which keeps two videos while they repeat."""
 
     pointwise = True
-    """Whether each point is found without regard to the others (`backends.Tracker`)."""
 
     def __init__(self, device: str | None = None) -> None:
         self._device = wp.get_device(device)
@@ -68,7 +58,6 @@ class BatchedTracker:
         return _follow_back(place, origin, total, visible)
 
     def _open(self, prediction: np.ndarray, target: np.ndarray) -> "_Videos":
-        """Both videos on the device, each put there once while it stays the same."""
         if self._videos is None or self._videos.target is not target:
             self._videos = _Videos(target)
         if self._videos.prediction is not prediction:
@@ -85,11 +74,7 @@ class BatchedTracker:
         body_id: np.ndarray,
         body: np.ndarray,
     ) -> np.ndarray:
-        """`confirm_tracks` [t k 2] of tracks [t k 2] in a prediction [t h w 3] of a target [t h w 3].
-
-        Args:
-            tracks, prediction, target, points, visible, body_id, body: as of `presence.confirm_tracks`.
-        """
+        """`presence.confirm_tracks` [t k 2], with the same arguments, of tracks [t k 2]."""
         videos = self._videos
         if videos is None or videos.target is not target or videos.prediction is not prediction or not tracks.size:
             return presence.confirm_tracks(tracks, prediction, target, points, visible, body_id, body)
@@ -102,7 +87,7 @@ class BatchedTracker:
 
 
 class _Videos:
-    """A true video as a device has it, with room for a predicted video before it."""
+    """A true video on a device, with space for a predicted video."""
 
     def __init__(self, target: np.ndarray) -> None:
         self.target = target
