@@ -23,7 +23,7 @@ def test_the_power_of_tasks_is_a_section_of_a_page(tmp_path: Path) -> None:
     )
     text = power_section(measure_power(rows, METRICS), rows)
     assert "8 episodes of `aloha_agilex`, `piper`, seed 800000 of each task" in text
-    assert "leave the mean of pck_strict: both, rest. The least power is 1.5, of `rest` for `pck_strict`." in text
+    assert "as the true video (pck_strict: both, rest). The least power is 1.5, of `rest` for `pck_strict`." in text
     assert "| `both` | none |" in text and "| `best` | over 10,000 |" in text
     assert "| `lift` | 8 |" in text and "| `lift` | 0.2 (0.9) |" in text and "| `rest` | 0.85 (0.9) |" in text
     write_power(tmp_path / "page.md", measure_power(rows, METRICS), rows)

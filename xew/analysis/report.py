@@ -353,7 +353,8 @@ def _write_explorer(scores: Scores, args: Args) -> None:
         predictions = find_predictions(args.rollouts)
         cells = [(folder, record) for folder, record in find_records(args.data) if record.hashes]
         scenes, left_out = choose_scenes(cells, names, len(names), predictions)
-        write_page(Page(TITLE, scenes, left_out, predictions, flow=False), (args.out / EXPLORER).parent)
+        given = scores.frame_zero != "absent"
+        write_page(Page(TITLE, scenes, left_out, predictions, flow=False, given=given), (args.out / EXPLORER).parent)
 
 
 def _make_answer_strip(scores: Scores, args: Args, tables: Sequence[RobotTable], rollouts: Rollouts) -> Strip | None:

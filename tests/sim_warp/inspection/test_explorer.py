@@ -182,6 +182,16 @@ def test_flow_is_a_row_of_the_film(data: Path, tmp_path: Path, monkeypatch: pyte
     assert (np.abs(frames[2, 390, 150].astype(int) - [0, 255, 255]) < 30).all() and frames[2, 260, 300].min() > 240
 
 
+def test_rollouts_may_begin_with_frame_1(folder: Path, tmp_path: Path) -> None:
+    truth = read_video(folder / "rgb.mkv")
+    write_rollout(tmp_path / "tree", "place_empty_cup", 4, "piper", truth[1:], {"model": "m"})
+    predictions = find_predictions([tmp_path / "tree"])
+    scenes, _ = choose_scenes([(folder, read_record(folder))], (), 6, predictions)
+    write_page(Page("t", scenes, 0, predictions, flow=False, given=False), tmp_path / "page")
+    content = read_script(next((tmp_path / "page" / "scenes").glob("*.js")))
+    assert content["films"][0]["psnr"] == [[None] * FRAMES]
+
+
 def test_a_frame_rate_that_no_film_has_is_an_error(folder: Path, tmp_path: Path) -> None:
     cells = [(folder, read_record(folder))]
     for change in ({"frame_rate": 1e-9}, {"frame_rate": 1e9}):

@@ -68,6 +68,8 @@ class Page:
     predictions: Predictions
     flow: bool = True
     """Whether optical flow is rendered from the commands."""
+    given: bool = True
+    """Whether rollouts hold the given frame 0; otherwise they begin with frame 1."""
 
 
 def find_predictions(roots: Iterable[Path]) -> Predictions:
@@ -202,7 +204,7 @@ def _write_films(stem: str, scene: Scene, page: Page, rows: dict[str, Row], out:
     truths = [truth for truth in rows["video"] if truth is not None]
     films = []
     for place, (label, rollouts) in enumerate(_models(scene, page.predictions)):
-        predicted = [_read_prediction(rollout, truth) for rollout, truth in zip(rollouts, truths, strict=True)]
+        predicted = [_read_prediction(rollout, truth, page.given) for rollout, truth in zip(rollouts, truths, strict=True)]
         pairs = list(zip(predicted, truths, strict=True))
         shown = dict(rows)
         if label:
@@ -235,8 +237,9 @@ def _models(scene: Scene, predictions: Predictions) -> list[tuple[str, list[Roll
     return models or [("", [None] * len(scene.cells))]
 
 
-def _read_prediction(rollout: Rollout | None, truth: np.ndarray) -> np.ndarray | None:
+def _read_prediction(rollout: Rollout | None, truth: np.ndarray, given: bool) -> np.ndarray | None:
     """The video of a rollout at its episode's size, at most as long as the episode: [t h w 3] uint8."""
     if rollout is None:
         return None
-    return resize_video(read_rollout_video(rollout), truth.shape[1:3])[: len(truth)]
+    video = resize_video(read_rollout_video(rollout), truth.shape[1:3])
+    return (video if given else np.concatenate([truth[:1], video]))[: len(truth)]
