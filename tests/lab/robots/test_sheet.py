@@ -43,7 +43,7 @@ def test_a_folder_that_cannot_be_made_is_refused(option: str, tmp_path: Path, mo
     monkeypatch.setattr(sys, "argv", ["sheet", "--robots", "piper", option, str(tmp_path / "file")])
     with pytest.raises(SystemExit) as left:
         main()
-    assert left.value.code == 2 and "name another place" in capsys.readouterr().err
+    assert left.value.code == 2 and "choose another path" in capsys.readouterr().err
 
 
 def test_an_unknown_robot_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:

@@ -102,7 +102,7 @@ def test_the_floor_of_a_model_is_the_truth_through_its_codec(
         assert means.loc[(robot, "ground_truth", "mask_iou"), "noise"] == pytest.approx(1 - softened)
         assert means.loc[(robot, "late", "psnr"), "noise"] == 0
     assert key in summary.floors and summary.floors in (rollouts.parent / "scores.summary.md").read_text()
-    assert "softened" in describe_floors(["late"], {})
+    assert "after a blur" in describe_floors(["late"], {})
     alone = summarize_robots(grade(rollouts, data, codec=(Path("runs/late"),), **codec | {"baselines": False}))
     pairs = alone.pairs[alone.pairs["metric"] == "mask_iou"].set_index("robot")
     assert set(pairs["other"]) == {CODEC_TRUTH}, "the true video was not graded"

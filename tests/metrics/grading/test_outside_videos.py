@@ -129,7 +129,7 @@ MISTAKES = [
     (long, "10 frames of 320x240, expected 9 frames"),
     (small, "9 frames of 160x120, expected 9 frames of 320x240"),
     (not_numbers, "float32 (9, 240, 320, 3), with NaN"),
-    (other_rate, "30.00 frames a second, its episode 16.67"),
+    (other_rate, "30.00 frames per second, its episode 16.67"),
     (two_videos, "rgb.npz, video.mp4"),
     (broken, "no readable frame"),
     (nothing, "0 PNG files"),
