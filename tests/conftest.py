@@ -61,6 +61,7 @@ LAB = (
     "tests/sim_warp/test_generate.py::test_a_run_killed_in_the_middle_is_taken_up_again",
     "tests/test_docs.py::test_a_page_does_what_it_says[add_a_robot]",
     "tests/test_docs.py::test_a_page_does_what_it_says[add_a_task]",
+    "tests/test_docs.py::test_a_page_runs_on_data[score_a_pytorch_model]",
     "tests/test_session.py::test_shapes_are_not_checked_where_that_is_turned_off",
 )
 """Beginnings of the names of tests that `make test-lab` runs and `make test` does not; single tests bear the mark `lab`."""

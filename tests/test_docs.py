@@ -112,10 +112,10 @@ def with_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]
     forget_modules(tmp_path)
 
 
-@pytest.mark.parametrize("page", WITH_DATA)
+@pytest.mark.parametrize(
+    "page", [pytest.param(page, marks=[pytest.mark.needs(NEEDS[page])] if page in NEEDS else []) for page in WITH_DATA]
+)
 def test_a_page_runs_on_data(page: str, with_data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    if page in NEEDS:
-        pytest.importorskip(NEEDS[page])
     found, ran = blocks(ROOT / "docs" / f"{page}.md"), 0
     for language, text in sorted(found, key=lambda block: block[0] == "bash"):  # a page shows its commands first
         wanted = [line for line in text.splitlines() if line.startswith(WITH_DATA[page])] if WITH_DATA[page] else []
