@@ -320,3 +320,50 @@ def test_british_spelling_is_found(tmp_path: Path) -> None:
     british = "the " + "col" + "our of the neighb" + "our"
     (tmp_path / "page.md").write_text(british)
     assert len(spelling_failures([tmp_path])) == 2
+
+
+TICS = re.compile(
+    r"\b(?:told|beside|in place of|that of|those of|of (?:its|their|one's|your|our) own|of a user's own|from nothing"
+    r"|trainings?(?= (?:of|is|are|was|were|each|differ|and|or|with|in|by|had|has)\b)|learned nothing|anew|by turns|goes? with"
+    r"|likewise|so that|whatever|whoever|the former|the latter|looks(?= (?:of|and|are))|room(?:s)?(?= (?:of|is|that|holds|may))"
+    r"|cannot be told|what (?:a|the) \w+ (?:is|was|has)|no(?:body|where) (?:else )?(?:has|is))\b",
+    re.IGNORECASE,
+)
+"""Phrases that CONTRIBUTING.md advises against."""
+PROSE = [REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").rglob("*.md"))]
+MOST_WORDS_OF_README, MOST_WORDS_OF_DOCS = 900, 25_000
+MOST_TICS, MOST_MEAN, LONG_SENTENCE, MOST_LONG = 2.0, 20.0, 35, 20
+"""Phrases per 1,000 words and words per sentence, at most, on any page; sentences over LONG_SENTENCE words, at most, in all."""
+
+
+def prose(text: str) -> str:
+    """Running text of a page: no code, tables, headings, link targets or HTML."""
+    text = re.sub(r"^[ ]*```.*?^[ ]*```", "", text, flags=re.MULTILINE | re.DOTALL)
+    lines = (line for line in text.splitlines() if not line.lstrip().startswith(("|", "#", "<", "!", "---", "    ")))
+    return " ".join(re.sub(r"`[^`]*`", "CODE", re.sub(r"\]\([^)]*\)", "]", line)) for line in lines if line.strip())
+
+
+def sentence_lengths(text: str) -> list[int]:
+    """Words of each sentence of running text."""
+    return [len(part.split()) for part in re.split(r"(?<=[.!?:])\s+(?=[A-Z*\[`])", text) if len(part.split()) > 2]
+
+
+@pytest.mark.parametrize("page", PROSE, ids=lambda page: str(page.relative_to(REPOSITORY)))
+def test_a_page_is_plain(page: Path) -> None:
+    text = prose(page.read_text())
+    lengths = sentence_lengths(text)
+    assert 1000 * len(TICS.findall(text)) <= MOST_TICS * len(text.split()), TICS.findall(text)
+    assert sum(lengths) <= MOST_MEAN * max(len(lengths), 1) or page.parent.name == "reference"
+
+
+def test_pages_are_short() -> None:
+    long = [n for page in PROSE for n in sentence_lengths(prose(page.read_text())) if n > LONG_SENTENCE]
+    assert len(long) <= MOST_LONG
+    assert len((REPOSITORY / "README.md").read_text().split()) <= MOST_WORDS_OF_README
+    pages = [page for page in PROSE if page.name != "README.md" or page.parent != REPOSITORY]
+    assert sum(len(prose(page.read_text()).split()) for page in pages if page.parent.name != "reference") <= MOST_WORDS_OF_DOCS
+
+
+def test_tics_and_long_sentences_are_counted() -> None:
+    text = prose("# Told\n\nIt is told so that it works. `told`\n\n```\ntold\n```\n| told |\n[a](told.md) b c.\n")
+    assert TICS.findall(text) == ["told", "so that"] and sentence_lengths(text) == [7, 4]
