@@ -4,7 +4,7 @@
     psnr(prediction, target)          # uint8 [t h w 3] -> float32 [t]
 
 docs/metrics.md shows each by an example. `Metric.total` takes video in parts. To add a metric, write a function in the file of
-its family and one entry in METRICS.
+its family and one entry in METRICS below.
 """
 
 import functools

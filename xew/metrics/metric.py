@@ -1,7 +1,7 @@
 """The type of a metric, and shared checks of arrays and chunks of frames.
 
 A metric compares one of INPUTS, which grade.py prepares from a prediction and the ground truth (truth.py). To add a metric of
-these inputs, write its function and its entry in METRICS.
+these inputs, write its function and its entry in METRICS (xew/metrics/__init__.py).
 """
 
 import functools

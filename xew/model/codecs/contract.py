@@ -1,4 +1,6 @@
-"""The interface of codecs: frames to latents and back, causally, the first frame alone and then groups of four.
+"""The interface and settings of codecs (by default conv_autoencoder): frames to latents and back, causally.
+
+The first frame is coded alone, then groups of four.
 
 Reads  uint8 [t h w 3], or on the device float [b t h w 3] in [-1, 1]; t = 4 k + 1
 Writes float32 latents [k + 1, h / factor, w / factor, channels] of about unit size

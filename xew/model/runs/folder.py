@@ -1,4 +1,4 @@
-"""The folder of a run: claiming and reading it, and tracing the checkpoints of an adapted run.
+"""The folder of a run: claiming, resuming, replacing and reading it, and tracing the checkpoints of an adapted run.
 
 <out>/config.yaml       the resolved config, itself a valid input
 <out>/codec/            the codec that the latents were made with

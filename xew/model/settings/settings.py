@@ -1,4 +1,4 @@
-"""The sections of configs/*.yaml. The defaults are the recommended recipe of configs/fixed.yaml."""
+"""The sections of configs/*.yaml, all but `codec` (codecs/contract.py). The defaults are those of configs/fixed.yaml."""
 
 from dataclasses import dataclass
 from pathlib import Path

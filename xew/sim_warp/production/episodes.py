@@ -1,4 +1,4 @@
-"""Simulated cells to episodes on disk; for a rejected seed only the headers."""
+"""Write simulated cells as episodes, in the format of xew/episode.py; for a rejected seed only the headers."""
 
 from collections.abc import Sequence
 from functools import cache
