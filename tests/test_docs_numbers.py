@@ -3,6 +3,7 @@
 import re
 from pathlib import Path
 
+import pandas as pd
 import pytest
 import yaml
 from jax.sharding import AbstractMesh
@@ -122,3 +123,15 @@ def test_what_there_is() -> None:
     starts = {family: f"{start:,}" for family, start in protocol.SEED_STARTS.items()}
     for family, name in (("train", "training"), ("validation", "validation"), ("test", "test")):
         assert cells(page("tasks"), name)[1] == starts[family]
+
+
+def test_table_2_of_the_paper() -> None:
+    """Our value and the paper's in parentheses, as in the committed table of the study."""
+    table = pd.read_csv(ROOT / "docs" / "results" / "six_tasks" / "tables" / "actions.csv")
+    names = ["PSNR [dB] ↑", "LPIPS ↓", "Mask IoU ↑", "PCK ↑", "Object error [px] ↓"]
+    table = table.assign(metric=table["column"].str.split(": ").str[1]).dropna(subset="paper")
+    for row in table["row"].unique():
+        ours = table[table["row"] == row].set_index("metric")
+        assert cells(page("reproduce_the_paper"), row)[1:] == [
+            f"{ours.loc[n, 'text']} ({ours.loc[n, 'paper']:g})" for n in names
+        ]
