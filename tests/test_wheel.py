@@ -18,7 +18,7 @@ import xew
 
 ROOT = Path(__file__).parents[1]
 SOURCES = ("xew", "configs", "docs", "examples", "benchmarks", "requirements", "lab", "tests")
-FILES = ("pyproject.toml", "MANIFEST.in", "README.md", "LICENSE", "CHANGELOG.md", "CITATION.cff", "Makefile")
+FILES = ("pyproject.toml", "MANIFEST.in", "README.md", "LICENSE", "CHANGELOG.md", "CONTRIBUTING.md", "CITATION.cff", "Makefile")
 BUILD = "import setuptools.build_meta as build; build.build_sdist('dist'); build.build_wheel('dist')"
 
 
