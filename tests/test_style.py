@@ -353,7 +353,7 @@ def test_a_page_is_plain(page: Path) -> None:
     text = prose(page.read_text())
     lengths = sentence_lengths(text)
     assert 1000 * len(TICS.findall(text)) <= MOST_TICS * len(text.split()), TICS.findall(text)
-    assert sum(lengths) <= MOST_MEAN * max(len(lengths), 1) or page.parent.name == "reference"
+    assert sum(lengths) <= MOST_MEAN * max(len(lengths), 1)
 
 
 def test_pages_are_short() -> None:
