@@ -31,6 +31,7 @@ METRIC = "lpips"
 BEST = "best model"
 TITLES = {PASTED_RENDER: "paste baseline", COPY: "frozen first frame"}
 """Names of the baselines that a model is compared with, the preferred one first."""
+PHRASES = {BETTER: "better than", WORSE: "worse than", UNRESOLVED: "not resolved from"}
 
 
 @dataclass(frozen=True)
@@ -57,16 +58,14 @@ def answer(contests: Sequence[Contest], strip: Strip | None) -> Answer:
     """The first screen from the contests of all held-out robots; `strip` shows truth, prediction and pasted render."""
     if not contests:
         return Answer("Open: no model was compared with a baseline on a held-out robot.", strip=strip)
-    robots = {word: [c.robot for c in contests if c.verdict == word] for word in (BETTER, WORSE, UNRESOLVED)}
-    head = "Unresolved" if not robots[BETTER] + robots[WORSE] else "No" if not robots[BETTER] else "In part"
-    head = "Yes" if len(robots[BETTER]) == len(contests) else head
-    title = TITLES[contests[0].baseline]
-    phrases = {
-        BETTER: f"better than the {title}",
-        WORSE: f"worse than the {title}",
-        UNRESOLVED: f"no different from the {title}",
-    }
-    parts = [f"{phrases[word]} on {' and '.join(names)}" for word, names in robots.items() if names]
+    verdicts = {contest.verdict for contest in contests}
+    alone = {BETTER: "Yes", UNRESOLVED: "Unresolved"}
+    head = alone.get(next(iter(verdicts)), "No") if len(verdicts) == 1 else "In part" if BETTER in verdicts else "No"
+    robots: dict[str, list[str]] = {}
+    for word, contest in product(PHRASES, contests):
+        if contest.verdict == word:
+            robots.setdefault(f"{PHRASES[word]} the {TITLES[contest.baseline]}", []).append(contest.robot)
+    parts = [f"{phrase} on {' and '.join(names)}" for phrase, names in robots.items()]
     return Answer(f"{head}: by LPIPS, the best model is {', and '.join(parts)}.", _chart(contests), strip)
 
 
