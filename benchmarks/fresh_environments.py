@@ -74,7 +74,7 @@ def run(*command: str | Path, folder: Path, environment: Path | None = None) -> 
     variables = {name: value for name, value in os.environ.items() if name not in LEFT_OUT}
     if environment is not None:
         variables |= {"VIRTUAL_ENV": str(environment), "PATH": f"{environment / 'bin'}{os.pathsep}{os.environ['PATH']}"}
-    done = subprocess.run([*map(str, command)], cwd=folder, env=variables, capture_output=True, text=True)
+    done = subprocess.run([*map(str, command)], cwd=folder, env=variables, capture_output=True, encoding="utf-8")
     if done.returncode:
         raise RuntimeError(f"{' '.join(map(str, command[1:]))[:160]}: {(done.stdout + done.stderr)[-1500:]}")
     return done.stdout

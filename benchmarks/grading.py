@@ -113,7 +113,7 @@ def grade(args: Args, estimators: str, processes: str) -> tuple[float, float]:
     command += ["--masks", estimators, "--tracks", estimators]
     command += ["--codec", str(args.codec.resolve())] if args.codec else []
     start, before = time.perf_counter(), busy_seconds()
-    with (args.out / "log.txt").open("a") as log:
+    with (args.out / "log.txt").open("a", encoding="utf-8") as log:
         done = subprocess.run(command, cwd=args.out, stdout=log, stderr=subprocess.STDOUT, env=environment(processes))
     assert done.returncode == 0, f"{' '.join(command)} failed; see {args.out}/log.txt"
     return time.perf_counter() - start, busy_seconds() - before

@@ -81,7 +81,7 @@ def main(args: Args) -> None:
         for side in ("xew", "diffusers") if args.peer else ("xew",):
             environment = os.environ | {"XLA_PYTHON_CLIENT_MEM_FRACTION": "0.94"}
             command = [sys.executable, __file__, *sys.argv[1:], "--cases", case, "--side", side]
-            with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) as process:
+            with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, encoding="utf-8") as process:
                 assert process.stdout is not None
                 for line in process.stdout:
                     tell(json.loads(line[7:])) if line.startswith("RESULT ") else print(line, end="", flush=True)

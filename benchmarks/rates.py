@@ -49,7 +49,8 @@ def main(args: Args) -> None:
             measured[field] = round(seconds / sum(costs[name].amount for name in done), 3)
     when = f"{args.study.name}, {time.strftime('%Y-%m')}"
     entry = asdict(replace(rates, machine=args.machine, measured=when, **measured))
-    RATES.write_text(json.dumps(json.loads(RATES.read_text()) | {find_size(study): entry}, indent=1) + "\n")
+    rates = json.loads(RATES.read_text(encoding="utf-8")) | {find_size(study): entry}
+    RATES.write_text(json.dumps(rates, indent=1) + "\n", encoding="utf-8")
     print(f"{RATES}: {', '.join(f'{name} {value}' for name, value in measured.items()) or 'nothing was measured'}")
 
 

@@ -72,7 +72,7 @@ def main(args: Args) -> int:
     with ThreadPoolExecutor(args.beside) as pool:
         for change in pool.map(lambda name: measure(name, args), args.changes):
             found.append(change)
-            (args.out / "results.json").write_text(json.dumps(found, indent=1) + "\n")
+            (args.out / "results.json").write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
             print(f"{change['change']}: {change.get('failed', 'done')}", flush=True)
     print(table(found))
     return sum("failed" in change for change in found)
@@ -117,7 +117,7 @@ def list_commands(run: Path, name: str, graded: Mapping[str, Path], args: Args) 
     """
     data = ["--data", str(args.data)]
     base = [str(args.config), *data, "--out", str(run), *CHANGES[name], "--train.steps", str(args.steps)]
-    base += ["--train.save-every", str(args.steps), "--train.sample-every", "0"]
+    base += ["--train.save-every", str(args.steps), "--train.samples", "0"]
     base += shlex.split(args.overrides)
     commands = {"latents": ["model.latents", *base], "training": ["model.train", *base, "--overwrite"]}
     for sampler, scores in graded.items():
@@ -148,7 +148,7 @@ def summarize(scores: Path) -> dict[str, list[float]]:
 def run_logged(command: Sequence[str], run: Path, args: Args) -> int:
     """Run a module of xew with its output appended to the run's log; its exit status."""
     environment = {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"} | os.environ
-    with (args.out / "logs" / f"{run.name}.log").open("a") as log:
+    with (args.out / "logs" / f"{run.name}.log").open("a", encoding="utf-8") as log:
         command = [sys.executable, "-m", f"xew.{command[0]}", *command[1:]]
         return subprocess.run(command, stdout=log, stderr=subprocess.STDOUT, env=environment).returncode
 
@@ -160,7 +160,7 @@ def last_loss(run: Path, steps: int) -> float:
     folder = next(path.parent for path in run.rglob("events.out.tfevents.*"))
     accumulator = EventAccumulator(str(folder))
     accumulator.Reload()
-    return float(np.mean([event.value for event in accumulator.Scalars("train/loss") if event.step > 7 * steps // 8]))
+    return float(np.mean([event.value for event in accumulator.Scalars("loss/train") if event.step > 7 * steps // 8]))
 
 
 def table(found: Sequence[dict[str, Any]]) -> str:

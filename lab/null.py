@@ -1,14 +1,16 @@
 """How often claims are answered where there is nothing to find: studies whose variants are all equal.
 
-    python -m lab.null [--studies 200 --scenes 24 --trainings 3 --spread 0.02]
+    python -m lab.null [--studies 200 --scenes 24]
 
 Every study has the scores of one model under all names. A claim that variants differ is then false whichever way it is
 answered; one that a difference is large is false only where it "holds", one that it is small only where it "fails". The rates
-are to be at most 5 % each, and the command prints them for four kinds of studies.
+are to be at most 5 % each, and the command prints them for studies with one run of each variant, several, or any mix of both,
+whose runs differ by 2 and by 5 %.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 import pandas as pd
@@ -20,8 +22,8 @@ from xew.analysis.tables.claims import CLAIMS
 from xew.analysis.tables.comparisons import Claim
 from xew.analysis.tables.findings import FAILS, HOLDS, UNMEASURED, ask
 from xew.config import user_errors
-from xew.protocol import PAPER_PARTS, PARTS, ROBOT_NAMES, TEST_SEED_START
-from xew.statistics import Mean, bootstrap_means, combine, pool_trainings
+from xew.protocol import PAPER_PARTS, PARTS, ROBOT_NAMES, TEST_SEED_START, reference
+from xew.statistics import Mean, bootstrap_means, combine
 
 METRICS = ("lpips", "mask_iou", "boundary_f1", "region_lpips", "pck", "trajectory_error")
 """Metrics that the paper's claims ask for."""
@@ -29,6 +31,10 @@ TRUE_OF_EQUALS = {"views saturate": HOLDS} | dict.fromkeys(
     ("flow gains much", "adaptation pays", "catastrophic forgetting", "systems degrade much"), FAILS
 )
 """Answers that are right where all variants are equal; of the other claims neither is."""
+ANCHORS = tuple(reference(embodiment=name).name for name in ("none", "nine_views", "robot_render"))
+"""Variants of which our study has several runs."""
+SPREADS = (0.02, 0.05)
+"""Standard deviations between runs, as shares of a score; our runs differ by 0.5 to 6.5 % in LPIPS."""
 TASKS = 6
 """Number of tasks that scenes are of."""
 HARDNESS, NOISE = 0.15, 0.04
@@ -42,12 +48,22 @@ class Null:
     """A kind of study in which there is nothing to find."""
 
     title: str
-    trainings: int = 1
-    """Number of trainings of each variant."""
+    runs: tuple[int, ...] = (1,)
+    """Numbers of training runs of the variants, given to them in turn."""
+    repeated: int = 1
+    """Number of runs of the variants of ANCHORS, where it is larger."""
     spread: float = 0.0
-    """Standard deviation between trainings, as a share of a score."""
+    """Standard deviation between runs, as a share of a score."""
+    by_seed: float = 0.0
+    """Share of this variance that is common to all runs of a seed."""
     unequal_robots: bool = False
     """Whether some robots are harder than others, for all variants alike."""
+
+    def runs_of(self, variants: Sequence[str]) -> dict[str, int]:
+        """Number of runs of each variant."""
+        return {
+            name: max(self.runs[i % len(self.runs)], self.repeated if name in ANCHORS else 1) for i, name in enumerate(variants)
+        }
 
 
 @dataclass(frozen=True)
@@ -82,10 +98,6 @@ class Args:
     """Number of studies of each kind."""
     scenes: int = 24
     """Number of scenes of a study, over six tasks."""
-    trainings: int = 3
-    """Number of trainings of each variant, where trainings differ."""
-    spread: float = 0.02
-    """Standard deviation between trainings, as a share of a score."""
     draws: int = 499
     """Number of bootstrap draws."""
 
@@ -109,6 +121,7 @@ class NullStudy(StudyGrades):
         variants, robots, metrics, trainings = (columns.get_level_values(level) for level in range(4))
         self._robot, self._metric = pd.Index(ROBOT_NAMES).get_indexer(robots), pd.Index(METRICS).get_indexer(metrics)
         self._training = pd.factorize(pd.MultiIndex.from_arrays([variants, trainings, metrics]))[0]
+        self._seed = pd.factorize(pd.MultiIndex.from_arrays([trainings, metrics]))[0]
         self._sign = np.where([self.metrics[metric].higher_is_better for metric in metrics], -1.0, 1.0)
         self._drawn: list[Mean | None] = []
         self._pooled: dict[tuple[str, tuple[str, ...], str], Mean | None] = {}
@@ -118,11 +131,14 @@ class NullStudy(StudyGrades):
         scenes, columns = self._cells.shape
         hard = rng.normal(0, HARDNESS, (scenes, 1))
         robots = rng.normal(0, ROBOTS_DIFFER * self._null.unequal_robots, (len(ROBOT_NAMES), len(METRICS)))
-        trainings = rng.normal(0, self._null.spread, columns)  # a training is good or bad on all robots
-        loss = hard + rng.normal(0, NOISE, (scenes, columns)) + robots[self._robot, self._metric] + trainings[self._training]
+        own, common = rng.normal(0, self._null.spread, (2, columns))  # a run is good or bad on all robots
+        share = self._null.by_seed
+        runs = np.sqrt(1 - share) * own[self._training] + np.sqrt(share) * common[self._seed]
+        loss = hard + rng.normal(0, NOISE, (scenes, columns)) + robots[self._robot, self._metric] + runs
         scores = self._scales[self._metric] * np.exp(self._sign * loss)
         self._drawn = list(bootstrap_means(scores, np.arange(len(scores)), self._strata, self._draws))
         self._pooled.clear()
+        self._run_means.clear()
 
     def variant_mean(self, variant: str, robots: tuple[str, ...], metric: str, shared_part: str = "") -> Mean | None:
         """As of `StudyGrades`; no episode is missing, so a pool of robots is the mean of theirs."""
@@ -130,16 +146,22 @@ class NullStudy(StudyGrades):
         if key not in self._pooled:
             means = [self._robot_mean(variant, robot, metric) for robot in robots]
             known = [mean for mean in means if mean]
-            self._pooled[key] = _pool(known) if len(known) == len(means) else None
+            self._pooled[key] = _average(known) if len(known) == len(means) else None
         return self._pooled[key]
 
     def _robot_mean(self, variant: str, robot: str, metric: str) -> Mean | None:
-        places = [self._columns.get((variant, robot, metric, training)) for training in self._trainings.get(variant, ())]
-        own = [mean for i in places if i is not None and (mean := self._drawn[i])]
-        return pool_trainings(own, variant, self._several) if own else None
+        runs = self._drawn_runs(variant, robot, metric)
+        return self._pool(variant, (robot,), metric, runs) if runs else None
+
+    def _means_of_runs(self, variant: str, robots: tuple[str, ...], metric: str) -> Mapping[int, float]:
+        return {seed: mean.value for seed, mean in self._drawn_runs(variant, robots[0], metric).items()}
+
+    def _drawn_runs(self, variant: str, robot: str, metric: str) -> Mapping[int, Mean]:
+        places = {run: self._columns.get((variant, robot, metric, run)) for run in self._trainings.get(variant, ())}
+        return {run: mean for run, i in places.items() if i is not None and (mean := self._drawn[i])}
 
 
-def _pool(means: Sequence[Mean]) -> Mean:
+def _average(means: Sequence[Mean]) -> Mean:
     return means[0] if len(means) == 1 else combine(lambda *values: np.stack(values).sum(axis=0) / len(values), *means)
 
 
@@ -155,9 +177,9 @@ def _empty_table(null: Null, scenes: int) -> pd.DataFrame:
         {"task": [f"task{i % TASKS}" for i in range(scenes)], "seed": TEST_SEED_START + np.arange(scenes) // TASKS}
     )
     graded = [(name, robot) for name, variant in variants.items() for robot in variant.graded_robots]
-    cells = pd.DataFrame(graded, columns=["variant", "robot"]).assign(model="reference", value=1.0)
-    for column, values in (("metric", METRICS), ("training", range(null.trainings))):
-        cells = cells.merge(pd.DataFrame({column: values}), how="cross")
+    runs = [(name, run) for name, count in null.runs_of(list(variants)).items() for run in range(count)]
+    cells = pd.DataFrame(graded, columns=["variant", "robot"]).merge(pd.DataFrame(runs, columns=["variant", "training"]))
+    cells = cells.assign(model="reference", value=1.0).merge(pd.DataFrame({"metric": METRICS}), how="cross")
     return cells.merge(scene, how="cross")
 
 
@@ -195,12 +217,16 @@ def names(claims: Sequence[Claim]) -> list[str]:
     return [claim.name for claim in claims]
 
 
-def nulls(trainings: int, spread: float) -> Iterator[Null]:
-    """The kinds of studies of the suite; the last shows what one training cannot say."""
-    yield Null("all variants equal")
-    yield Null(f"{trainings} trainings that differ by {spread:.0%}", trainings, spread)
+def nulls() -> Iterator[Null]:
+    """The kinds of studies of the suite."""
+    yield Null("all runs equal")
     yield Null("robots of unequal difficulty", unequal_robots=True)
-    yield Null(f"one training, where others differ by {spread:.0%}", 1, spread)
+    for spread, by_seed in product(SPREADS, (0.0, 0.9)):
+        differ = f"runs differ by {spread:.0%}{', mostly by their seed' if by_seed else ''}"
+        yield Null(f"{differ}; one of each variant", spread=spread, by_seed=by_seed)
+        yield Null(f"{differ}; three of three variants", repeated=3, spread=spread, by_seed=by_seed)
+        yield Null(f"{differ}; one, two and three in turn", (1, 2, 3), spread=spread, by_seed=by_seed)
+        yield Null(f"{differ}; three of each variant", (3,), spread=spread, by_seed=by_seed)
 
 
 def format_rates(rates: Rates) -> str:
@@ -214,7 +240,7 @@ def format_rates(rates: Rates) -> str:
 
 def main(args: Args) -> None:
     """Print the rates of all kinds of studies."""
-    for null in nulls(args.trainings, args.spread):
+    for null in nulls():
         print(format_rates(measure(null, args.studies, args.scenes, args.draws)), flush=True)
 
 

@@ -115,7 +115,7 @@ def write_section(path: Path, heading: str, text: str) -> None:
     old = re.search(rf"^{re.escape(heading)}\n.*?(?=^#{{1,{most}}} |\Z)", page, re.MULTILINE | re.DOTALL)
     start, end = old.span() if old else (len(page), len(page))
     before = f"{page[:start].rstrip()}\n\n" if page[:start].strip() else ""
-    write_text(path, f"{before}{section}{page[end:]}".rstrip() + "\n")
+    write_text(path, f"{before}{section}{page[end:]}".rstrip() + "\n", within=path.parent)
 
 
 if __name__ == "__main__":

@@ -67,7 +67,7 @@ clip: {frames: 5, height: 64, width: 80}
 codec: {weights: TINY_CODEC}
 model: {size: tiny, action: "additions:CONDITION",
   history: [], reference: frame, visibility: joint, prediction: velocity, dtype: float32, remat: none, embodiment: none}
-train: {steps: 1, batch: 2, sample_every: 0,
+train: {steps: 1, batch: 2, samples: 0,
   optimizer: adamw, warmup_steps: 0, decay_to: 1, ema: 0, motion_loss_weight: 0}
 rollout: {steps: 1, batch: 1, max_frames: 5,
   sampler: euler}

@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from xew.concurrency import free_gpu_memory, leave_with_parent, map_in_order, map_in_processes
+from xew.episode import EpisodeError
 
 
 def test_free_memory_of_gpus_is_asked_of_nvidias_tool(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -192,6 +193,20 @@ def test_no_process_is_left_behind_who_takes_no_more_results(tmp_path: Path) -> 
     assert next(results) == 4
     results.close()
     assert all(map(is_gone, processes_of(tmp_path)))
+
+
+def kill_itself(number: int) -> int:
+    os.kill(os.getpid(), signal.SIGKILL)
+    return number
+
+
+def open_killed() -> Callable[[int], int]:
+    return kill_itself
+
+
+def test_a_killed_process_is_told_in_one_line() -> None:
+    with pytest.raises(EpisodeError, match=r"^a worker process was killed.* run the command again, and end other programs"):
+        list(map_in_processes(open_killed, [1, 2, 3], 2))
 
 
 def open_nothing() -> Callable[[int], int]:

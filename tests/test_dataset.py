@@ -67,9 +67,11 @@ def test_what_changes_on_disk_is_seen(data: Path, reads: Counter[Path]) -> None:
     folder, record = first.cells[0]
     path = folder / "episode.json"
     before = path.stat()
-    path.write_text(json.dumps(json.loads(path.read_text()) | {"robot": "PIPER"}, indent=1) + "\n")  # as many bytes
+    path.write_text(
+        json.dumps(json.loads(path.read_text()) | {"scene_hash": record.scene_hash[::-1]}, indent=1) + "\n"
+    )  # as many bytes
     os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
-    assert read_dataset(data).cells[0][1].robot == "PIPER"
+    assert read_dataset(data).cells[0][1].scene_hash == record.scene_hash[::-1] != record.scene_hash
     shutil.rmtree(folder)
     assert [cell for cell, _ in read_dataset(data).cells] == [cell for cell, _ in first.cells[1:]]
     write_episode(data, Record(record.task, 7, "piper", False, "grasp"))

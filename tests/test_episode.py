@@ -2,8 +2,11 @@
 
 import errno
 import json
+import re
+import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -12,7 +15,7 @@ import numpy as np
 import pytest
 
 from xew import episode
-from xew.dataset import find_accepted, find_records
+from xew.dataset import find_accepted, find_records, read_dataset
 from xew.episode import (
     HEIGHT,
     SCHEMA_VERSION,
@@ -22,6 +25,8 @@ from xew.episode import (
     States,
     array_hash,
     episode_folder,
+    read_npz,
+    read_pixels,
     read_record,
     read_states,
     read_video,
@@ -58,8 +63,8 @@ def noise(seed: int = 0, frames: int = FRAMES) -> np.ndarray:
 
 
 RECORD = Record(
-    "grab_roller", 7, "piper", True, None, "", "use both arms", FRAMES, 1000 / 60, ("roller",), ("left/link1",), "abc", {},
-    {"xew": "0"}, "a processor",
+    "grab_roller", 7, "piper", True, None, "", "use both arms", FRAMES, 1000 / 60, ("roller", "cup"),
+    ("left/link1", "left/link2", "left/link3"), "abc", {}, {"xew": "0"}, "a processor",
 )  # fmt: skip
 
 
@@ -70,7 +75,8 @@ def folder(tmp_path: Path) -> Path:
 
 def test_every_field_comes_back(folder: Path) -> None:
     record, states, expected = read_record(folder), read_states(folder), some_states()
-    assert record == replace(RECORD, hashes=record.hashes) and set(record.hashes) == {"states", "rgb", "robot"}
+    assert record == replace(RECORD, hashes=record.hashes, files=record.files)
+    assert set(record.hashes) == {"states", "rgb", "robot"} and set(record.files) == {"states.npz", "rgb.mkv", "robot.mkv"}
     for field in fields(States):
         found, wanted = getattr(states, field.name), getattr(expected, field.name)
         assert found.dtype == wanted.dtype, field.name
@@ -145,6 +151,152 @@ def test_a_broken_header_is_named(folder: Path, text: str) -> None:
     (folder / "episode.json").write_bytes(text.encode(errors="surrogateescape"))
     with pytest.raises(EpisodeError, match=r"episode.json is damaged .*; delete its folder and run generate again"):
         read_record(folder)
+
+
+def flip_bits(folder: Path) -> None:
+    """In the packets of the first frames, so that FFmpeg by itself would conceal them."""
+    path, rng = folder / "rgb.mkv", np.random.default_rng(1)
+    content = bytearray(path.read_bytes())
+    for place in rng.integers(1000, len(content) // 5, 40):
+        content[place] ^= 1 << int(rng.integers(8))
+    path.write_bytes(content)
+
+
+def exchange(folder: Path) -> None:
+    shutil.copy(folder / "robot.mkv", folder / "rgb.mkv")
+
+
+def add_a_frame(folder: Path) -> None:
+    write_video(folder / "rgb.mkv", np.concatenate([noise(1), noise(2)]))
+
+
+@pytest.mark.parametrize("earlier", [False, True], ids=["", "without digests of files"])
+@pytest.mark.parametrize("damage", [flip_bits, exchange, add_a_frame])
+def test_a_video_is_that_of_its_header(damage: Callable[[Path], None], earlier: bool, folder: Path) -> None:
+    if earlier:
+        edit(folder, files={})
+    np.testing.assert_array_equal(read_pixels(folder, "rgb"), noise(1))
+    np.testing.assert_array_equal(read_pixels(folder, "rgb", most=2), noise(1)[:2])
+    damage(folder)
+    for most in (1, None):
+        with pytest.raises(EpisodeError, match=r"piper.*(is damaged: it holds|rgb has hash .*, expected)"):
+            read_pixels(folder, "rgb", most)
+
+
+@pytest.mark.parametrize("most", [None, 9])
+def test_a_video_is_as_long_as_its_header_says(most: int | None, folder: Path) -> None:
+    edit(folder, frame_count=9)
+    with pytest.raises(EpisodeError, match="has 5 frames, its header says 9"):
+        read_pixels(folder, "rgb", most)
+
+
+def test_a_video_that_was_encoded_again_is_compared_once(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_video(folder / "rgb.mkv", noise(1), frame_rate=25)
+    hashed: list[int] = []
+    monkeypatch.setattr(episode, "array_hash", lambda video: hashed.append(len(video)) or array_hash(video))
+    for _ in range(3):
+        np.testing.assert_array_equal(read_pixels(folder, "rgb", 1), noise(1)[:1])
+    assert hashed == [FRAMES]
+
+
+def test_frames_of_any_size_are_not_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(episode, "MOST_PIXELS", WIDTH * HEIGHT - 1)
+    write_video(tmp_path / "v.mkv", noise())
+    with pytest.raises(EpisodeError, match="frames of 320x240 pixels"):
+        read_video(tmp_path / "v.mkv")
+
+
+def test_only_the_readers_of_this_module_decode_episodes() -> None:
+    """Others read them by `read_pixels`, which compares what it reads."""
+    sources = [*(ROOT / "xew").rglob("*.py"), *(ROOT / "lab").rglob("*.py")]
+    assert [path.name for path in sources if re.search(r"\bread_video\b", path.read_text())] == ["episode.py"]
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "said"),
+    [
+        ("action", lambda a: a[:, :3], "action is float32 [5, 3], expected float32 [5, 16]"),
+        ("action", lambda a: a[:-1], "joint_pos is float32 [5, 16], expected float32 [4, 16]"),
+        ("joint_vel", lambda a: a.astype(np.float64), "joint_vel is float64 [5, 16], expected float32 [5, 16]"),
+        ("tool_pose", lambda a: a[:, :1], "tool_pose is float32 [5, 1, 7], expected float32 [5, 2, 7]"),
+        ("object_pose", lambda a: np.float32(1), "object_pose is float32 [], expected float32 [5, 'o', 7]"),
+        ("object_joint", lambda a: a[:, :1], "object_joint is float32 [5, 1], expected float32 [5, 2]"),
+        ("contact", lambda a: a.astype(np.uint8), "contact is uint8 [5, 2, 2], expected bool [5, 2, 2]"),
+        ("penetration", lambda a: a * np.inf, "penetration has NaN or infinite numbers"),
+        ("keypoints", lambda a: a[:, :2], "keypoint_visible is bool [5, 3], expected bool [5, 2]"),
+        ("keypoints", lambda a: a * np.nan, "keypoints has NaN or infinite numbers"),
+        ("robot_mask", lambda a: np.uint8(1), "is damaged"),
+        ("robot_mask", lambda a: a[:3], "robot_mask is bool [3, 240, 320], expected bool [5, 240, 320]"),
+        ("robot_mask", lambda a: a.astype(np.float32), "is damaged"),
+        ("intrinsics", lambda a: a[:2], "intrinsics is float64 [2, 3], expected float64 [3, 3]"),
+        ("extrinsics", lambda a: a.astype(object), "is damaged"),
+        ("keypoint_visible", lambda a: None, "is damaged"),
+    ],
+)  # fmt: skip
+def test_states_of_another_form_are_refused(name: str, change: Callable, said: str, folder: Path) -> None:
+    with np.load(folder / "states.npz") as stored:
+        arrays = dict(stored)
+    np.savez(folder / "states.npz", **arrays | {name: change(arrays[name])})
+    edit(folder, files={})
+    with pytest.raises(EpisodeError, match=re.escape(said)):
+        read_states(folder)
+
+
+def test_states_are_those_of_their_header(folder: Path, tmp_path: Path) -> None:
+    other = write_episode(tmp_path, replace(RECORD, seed=8), some_states(1))
+    shutil.copy(other / "states.npz", folder / "states.npz")
+    with pytest.raises(EpisodeError, match=r"piper: states has hash .*, expected"):
+        read_states(folder)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"frame_count": 9}, "5 frames, its header 9"),
+        ({"object_names": ["cup"]}, "2 objects, its header 1"),
+        ({"keypoint_names": []}, "3 keypoints, its header 0"),
+    ],
+)
+def test_states_fit_their_header(change: dict[str, object], said: str, folder: Path) -> None:
+    edit(folder, **change)
+    with pytest.raises(EpisodeError, match=said):
+        read_states(folder)
+
+
+def test_numbers_that_are_unknown_or_out_of_sight_may_be_nan(tmp_path: Path) -> None:
+    states = some_states()
+    states.keypoints[~states.keypoint_visible] = np.nan
+    unknown = replace(states, joint_pos=states.joint_pos * np.nan)
+    write_episode(tmp_path, replace(RECORD, source="elsewhere", unknown=("joint_pos",)), unknown)
+    assert np.isnan(read_states(episode_folder(tmp_path, "grab_roller", 7, "piper")).joint_pos).all()
+
+
+def test_an_archive_that_unpacks_to_gigabytes_is_not_unpacked(folder: Path) -> None:
+    np.savez_compressed(folder / "states.npz", action=np.zeros(2**28, np.uint8))
+    assert (folder / "states.npz").stat().st_size < 300_000
+    with pytest.raises(EpisodeError, match=r"is damaged \(\d+ bytes unpack to 2684\d+\)"):
+        read_states(folder)
+    np.savez_compressed(folder / "states.npz", mask=np.zeros(2**26, bool))
+    assert read_npz(folder / "states.npz")["mask"].nbytes == 2**26
+
+
+@pytest.mark.parametrize("place", ["grab_roller/0000007/ur5_wsg", "grab_roller/0000008/piper", "lift_pot/0000007/piper"])
+def test_a_folder_that_was_copied_or_renamed_is_refused(place: str, folder: Path, tmp_path: Path) -> None:
+    shutil.copytree(folder, tmp_path / place)
+    for read in (read_record, read_states, verify_episode, lambda folder: read_pixels(folder, "rgb")):
+        with pytest.raises(EpisodeError, match=r"is the header of grab_roller/0000007/piper, in a folder that was copied"):
+            read(tmp_path / place)
+    problems: list[str] = []
+    assert [found for found, _ in read_dataset(tmp_path, problems).cells] == [folder] and len(problems) == 1
+
+
+def test_a_folder_may_be_named_in_any_way_that_leads_there(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "linked").symlink_to(tmp_path)
+    monkeypatch.chdir(folder)
+    for named in (Path(), Path("../piper"), tmp_path / "linked" / folder.relative_to(tmp_path), folder / ".." / "piper"):
+        assert read_record(named).robot == "piper"
 
 
 def test_an_unknown_key_and_an_unknown_hash_are_named(folder: Path) -> None:

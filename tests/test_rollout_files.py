@@ -1,5 +1,6 @@
 """Rollouts of anybody's making are read whole or not at all, and nothing outside their tree is."""
 
+import errno
 import json
 from collections.abc import Callable
 from fractions import Fraction
@@ -11,7 +12,8 @@ import numpy as np
 import pytest
 
 from xew.episode import write_video
-from xew.rollout import RolloutError, find_rollouts, read_rollout, read_rollout_video
+from xew.files import digest_files
+from xew.rollout import RolloutError, find_rollouts, read_as_graded, read_rollout, read_rollout_video, write_rollout
 
 RATE = 1000 / 60
 FRAMES = 12
@@ -58,6 +60,24 @@ def test_what_we_write_is_read_exactly_and_opencvs_too(folder: Path) -> None:
         writer.write(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
     writer.release()
     assert (read(folder) == VIDEO).all()
+
+
+def write_png(path: Path) -> None:
+    cv2.imwrite(str(path), VIDEO[0])
+
+
+@pytest.mark.parametrize(
+    ("name", "store"),
+    [("rgb.mkv", lambda path: write(path)), ("v.npz", lambda path: np.savez(path, VIDEO)), ("0.png", write_png)],
+)
+def test_what_is_read_has_the_digest_that_was_asked_for(name: str, store: Callable[[Path], None], folder: Path) -> None:
+    store(folder / name)
+    rollout = read_rollout(folder)
+    digest = digest_files(rollout.video)
+    assert read_rollout_video(rollout, digest=digest).shape[1:] == VIDEO.shape[1:]
+    (folder / name).write_bytes((folder / name).read_bytes() + b"0")
+    with pytest.raises(RolloutError, match="was replaced while this command ran"):
+        read_rollout_video(rollout, digest=digest)
 
 
 @pytest.mark.parametrize("name", ["rgb.mkv", "rgb.mp4"])
@@ -140,7 +160,7 @@ def test_pngs_are_in_the_order_of_their_numbers_and_are_whole(folder: Path) -> N
         (VIDEO[0][..., 0], "gray"),
         (np.dstack([VIDEO[0], VIDEO[0][..., :1]]), "alpha"),
         (VIDEO[0].astype(np.uint16), "uint16"),
-        (VIDEO[0][:-1], "expected one size"),
+        (VIDEO[0][:-1], "changes its size at frame 7"),
     ):
         png(folder, 7, image)
         message = refusal(folder)
@@ -219,3 +239,51 @@ def test_problems_are_told_one_by_one_if_asked(folder: Path) -> None:
     problems: list[str] = []
     assert [rollout.robot for rollout in find_rollouts(folder.parents[2], problems)] == ["piper"]
     assert len(problems) == 1 and str(other) in problems[0]
+
+
+@pytest.mark.parametrize("name", ["RGB.MKV", "video.Mp4", "a b.mov", "prédiction.avi"])
+def test_endings_in_any_case_are_videos_and_hidden_files_are_none(folder: Path, name: str) -> None:
+    write(folder / f"rgb{Path(name).suffix.lower()}", codec="mpeg4")
+    (folder / f"rgb{Path(name).suffix.lower()}").rename(folder / name)
+    (folder / f"._{name}").write_bytes(b"\0\5\x16\7")
+    (folder / ".cache").mkdir()
+    (folder / ".cache" / "0.png").write_bytes(b"")
+    assert read_rollout(folder).video == (folder / name,)
+    assert read(folder).shape == VIDEO.shape
+
+
+def test_what_is_found_instead_of_a_video_is_named(folder: Path) -> None:
+    for name in ("0.jpg", "1.jpg", "rgb.gif", "rollout.json"):
+        (folder / name).write_text("{}")
+    assert "found videos none and 0 PNG files, 1 .gif, 2 .jpg; expected one video (.mkv, .mp4, .mov" in refusal(folder)
+
+
+def test_an_npz_of_zeros_is_no_bomb(folder: Path) -> None:
+    np.savez_compressed(folder / "rgb.npz", np.zeros((1000, 480, 640, 3), np.uint8))
+    assert "unpack to 921600" in refusal(folder)
+
+
+@pytest.mark.parametrize("given", [True, False])
+@pytest.mark.parametrize("size", [(24, 32), (12, 16), (48, 64)])
+def test_a_rollout_is_shown_as_it_was_graded(size: tuple[int, int], given: bool, folder: Path) -> None:
+    """At the episode's size, frame by frame, and no longer than the episode."""
+    truth = np.full((FRAMES, 24, 32, 3), 40, np.uint8) + np.arange(FRAMES, dtype=np.uint8)[:, None, None, None] * 10
+    np.savez(folder / "rgb.npz", np.stack([cv2.resize(frame, size[::-1]) for frame in (*truth[not given :], truth[0])]))
+    assert np.array_equal(read_as_graded(read_rollout(folder), truth, given), truth)
+
+
+def test_a_file_larger_than_memory_is_not_read(folder: Path) -> None:
+    with (folder / "rgb.mp4").open("wb") as file:
+        file.truncate(2**40)
+    assert "to 1099511627776 bytes, expected at most 1073741824" in refusal(folder)
+
+
+def test_a_full_disk_is_said_without_the_temporary_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(path: Path, *arguments: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device", str(path))
+
+    monkeypatch.setattr("xew.rollout.write_video", full)
+    with pytest.raises(RolloutError) as error:
+        write_rollout(tmp_path, "stack_bowls", 7, "piper", VIDEO, {})
+    assert str(error.value).endswith("piper: No space left on device. Free some space or choose another --out.")
+    assert ".writing" not in str(error.value)

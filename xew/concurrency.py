@@ -9,13 +9,18 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from itertools import cycle, islice
 from multiprocessing.queues import SimpleQueue
 from typing import Any, TypeVar
 
+from xew.names import EpisodeError
+
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
+KILLED = "a worker process was killed, perhaps for lack of memory. Completed work is stored: run the command again"
+"""Message for a worker that the system has killed."""
 PARSING = threading.RLock()
 """Lock for everything that parses Python in a thread: reading .npy headers, building kernels. In Python 3.11 two parsers at a
 time can raise SystemError (github.com/python/cpython/issues/106905)."""
@@ -29,7 +34,7 @@ def usable_cores() -> int:
 def visible_gpus() -> tuple[str, ...]:
     """NVIDIA's GPUs that this process may use, as CUDA_VISIBLE_DEVICES names them."""
     try:
-        listed = subprocess.run(["nvidia-smi", "-L"], capture_output=True, text=True, check=True).stdout
+        listed = subprocess.run(["nvidia-smi", "-L"], capture_output=True, encoding="utf-8", check=True).stdout
     except (OSError, subprocess.CalledProcessError):
         return ()
     count = len([line for line in listed.splitlines() if line.startswith("GPU ")])
@@ -43,7 +48,7 @@ def free_gpu_memory(gpus: Sequence[str]) -> tuple[float, ...]:
         return ()
     query = ("nvidia-smi", "--query-gpu=memory.free", "--format=csv,noheader,nounits", "-i", ",".join(gpus))
     try:
-        output = subprocess.run(query, capture_output=True, text=True, check=True).stdout
+        output = subprocess.run(query, capture_output=True, encoding="utf-8", check=True).stdout
         return tuple(float(mebibytes) * 2**20 / 1e9 for mebibytes in output.split())
     except (OSError, subprocess.CalledProcessError, ValueError):
         return ()
@@ -131,6 +136,9 @@ def map_in_processes(
         processes: largest number of processes.
         imported: modules that the processes need; see `open_processes`.
         gpus: GPUs as CUDA_VISIBLE_DEVICES names them, one for each process in turn; default: every process sees all.
+
+    Raises:
+        EpisodeError: a process was killed.
     """
     count = min(processes, len(items))
     pool = open_processes(count, imported, _open_function, (opener,), gpus)
@@ -138,6 +146,8 @@ def map_in_processes(
         for _ in range(count):
             pool.submit(_open_early)
         yield from pool.map(_call_function, items)
+    except BrokenProcessPool as error:
+        raise EpisodeError(f"{KILLED}, and end other programs or use fewer processes if it happens again.") from error
     finally:
         pool.shutdown(cancel_futures=True)
 

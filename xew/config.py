@@ -13,12 +13,14 @@ import difflib
 import errno
 import functools
 import importlib
+import io
 import json
 import math
 import os
 import re
 import select
 import sys
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TextIO, TypeVar, cast
@@ -27,8 +29,8 @@ import cattrs
 import tyro
 import yaml
 
-from xew.files import demand_regular, write_text
-from xew.names import EpisodeError
+from xew.files import read_text, write_text
+from xew.names import SHOWN_LETTERS, UserError, plain_line, shorten
 
 T = TypeVar("T")
 
@@ -41,8 +43,14 @@ BASE = "base"
 """Key of a config that names its base config."""
 LARGEST = 2**63 - 1
 """Largest integer in a config."""
+MOST_VALUES = 100_000
+"""Largest number of values in a YAML file; an alias counts as the values that it repeats."""
+MOST_NAMED = 5
+"""Largest number of unknown keys that a message names."""
 IMPORT_PATH = re.compile(r"([^\W\d]\w*(?:\.[^\W\d]\w*)*):[^\W\d]\w*")
 """Pattern of `module:NAME`."""
+SURROGATES = re.compile("[\ud800-\udfff]")
+"""Letters that no file can hold as UTF-8 text."""
 TRUST = "XEW_TRUST"
 """Environment variable with the admitted modules, separated by commas; child processes inherit it."""
 
@@ -53,7 +61,7 @@ DISK_FAULTS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPER
 """System errors that are reported as the user's even if they name no file."""
 
 
-class ConfigError(Exception):
+class ConfigError(UserError):
     """A user's setting cannot be used; the message gives the remedy."""
 
 
@@ -123,7 +131,7 @@ def read_yaml(path: Path | str) -> Any:
 
 def _read_content(path: Path) -> Any:
     try:
-        return yaml.safe_load(demand_regular(path).read_text())
+        return parse_yaml(read_text(path))
     except OSError as error:
         siblings = sorted(str(p) for p in path.parent.glob("*.yaml"))
         known = f" The folder has {', '.join(siblings)}." if siblings else ""
@@ -132,6 +140,45 @@ def _read_content(path: Path) -> Any:
         raise ConfigError(f"{path} is nested too deeply for a config.") from error
     except (yaml.YAMLError, ValueError) as error:
         raise ConfigError(f"{path} is not YAML: {error}") from error
+
+
+class _StrictLoader(yaml.SafeLoader):
+    """PyYAML's safe loader, which refuses a key that stands twice in a mapping and aliases that repeat too many values."""
+
+    def get_single_node(self) -> yaml.Node | None:
+        node: yaml.Node | None = super().get_single_node()
+        if node is not None and _count_values(node, {}) > MOST_VALUES:
+            raise yaml.YAMLError(f"with its aliases it has more than {MOST_VALUES:,} values")
+        return node
+
+    def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:
+        node: yaml.MappingNode = super().compose_mapping_node(anchor)
+        keys = Counter((key.tag, key.value) for key, _ in node.value if isinstance(key, yaml.ScalarNode))
+        for (_, name), count in keys.items():
+            if count > 1:
+                raise yaml.MarkedYAMLError(problem=f"the key {shorten(name)} stands there twice", problem_mark=node.start_mark)
+        return node
+
+
+def _count_values(node: yaml.Node, known: dict[int, float]) -> float:
+    """Number of values at and below a node, infinite for a node that holds itself; `known` has the numbers by node."""
+    if id(node) not in known:
+        known[id(node)] = math.inf
+        children = node.value if isinstance(node, yaml.CollectionNode) else ()
+        if isinstance(node, yaml.MappingNode):
+            children = [child for pair in children for child in pair]
+        known[id(node)] = 1 + sum(_count_values(child, known) for child in children)
+    return known[id(node)]
+
+
+def parse_yaml(text: str) -> Any:
+    """The content of a YAML text.
+
+    Raises:
+        yaml.YAMLError: it is not YAML, has a key twice, or its aliases repeat too many values.
+        ValueError, RecursionError: a value cannot be represented; it is nested too deeply.
+    """
+    return yaml.load(text, _StrictLoader)
 
 
 def merge_settings(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
@@ -151,12 +198,13 @@ def parse(cls: type[T], content: Any, source: str) -> T:
         return CONVERTER.structure(content, cls)
     except (cattrs.BaseValidationError, ValueError, TypeError) as error:
         reasons = cattrs.transform_error(error, path="", format_exception=_reason)
-        raise ConfigError("\n".join(f"{source}: {_put_path_first(reason)}" for reason in reasons)) from error
+        raise ConfigError(*(f"{source}: {_put_path_first(reason)}" for reason in reasons)) from error
 
 
 def save(config: Any, path: Path) -> None:
     """Write the resolved config as YAML that `load` reads back to an equal object. Raises OSError if it fails."""
-    write_text(path, yaml.safe_dump(CONVERTER.unstructure(config), sort_keys=False, allow_unicode=True))
+    text = yaml.safe_dump(CONVERTER.unstructure(config), sort_keys=False, allow_unicode=True)
+    write_text(path, text, within=path.parent)
 
 
 def digest(config: Any) -> str:
@@ -176,18 +224,29 @@ def pick(registry: Mapping[str, T], name: str, kind: str, also: tuple[type, ...]
     if name in registry:
         return registry[name]
     if ":" in name:
-        module, _, attribute = name.partition(":")
         try:
-            imported = getattr(importlib.import_module(module), attribute)
+            imported = import_named(name)
         except (ImportError, AttributeError, ValueError) as error:
             raise ConfigError(f"cannot import the {kind} {name!r}: {error}; expected module:NAME.") from error
         expected = tuple({type(entry) for entry in registry.values() if entry is not None})
         if not isinstance(imported, (*expected, *also)):
             names = " or ".join(kind.__name__ for kind in expected)
             raise ConfigError(f"the {kind} {name!r} is a {type(imported).__name__}; expected a {names}.")
-        admit([module])  # the user named it, so files may name it from now on
+        admit([name])  # the user named it, so files may name it from now on
         return cast(T, imported)
     raise ConfigError(f"unknown {kind} {name!r};{suggestion(name, registry)} known: {', '.join(registry)}, or module:NAME.")
+
+
+def import_named(name: str) -> Any:
+    """The object of `module:NAME`, which the user named; the current folder is searched last.
+
+    Raises:
+        ImportError, AttributeError, ValueError: there is none.
+    """
+    module, _, attribute = name.partition(":")
+    if os.getcwd() not in sys.path:
+        sys.path.append(os.getcwd())  # commands leave it out, see xew/__init__.py
+    return getattr(importlib.import_module(module), attribute)
 
 
 def pick_recorded(registry: Mapping[str, T], name: str, kind: str) -> T:
@@ -268,6 +327,8 @@ def _admitted() -> list[str]:
 
 def suggestion(name: str, known: Iterable[str]) -> str:
     """' did you mean …?' or nothing."""
+    if len(str(name)) > SHOWN_LETTERS:
+        return ""
     close = difflib.get_close_matches(str(name), list(known), n=1)
     return f" did you mean {close[0]!r}?" if close else ""
 
@@ -280,6 +341,9 @@ def user_errors(main: Callable[..., T]) -> Callable[..., T]:
 
     @functools.wraps(main)
     def guarded(*args: Any, **kwargs: Any) -> T:
+        for stream in (sys.stdout, sys.stderr):
+            if isinstance(stream, io.TextIOWrapper):
+                stream.reconfigure(errors="backslashreplace")  # names that are not UTF-8, terminals that are not
         try:
             try:
                 return main(*args, **kwargs)
@@ -290,14 +354,14 @@ def user_errors(main: Callable[..., T]) -> Callable[..., T]:
             if not _silence_closed_pipes():
                 raise
             raise SystemExit(PIPE_CLOSED) from None
-        except (ConfigError, EpisodeError) as error:
+        except UserError as error:
             print(f"error: {error}", file=sys.stderr)
             raise SystemExit(2) from None
         except OSError as error:
             if error.filename is None and error.errno not in DISK_FAULTS:
                 raise
-            where = f"{error.filename}: " if error.filename is not None else ""
-            print(f"error: {where}{error.strerror}; fix that, or choose another path.", file=sys.stderr)
+            where = f"{os.fsdecode(error.filename)}: " if error.filename is not None else ""
+            print(plain_line(f"error: {where}{error.strerror}; fix that, or choose another path."), file=sys.stderr)
             raise SystemExit(2) from None
         except KeyboardInterrupt:
             print("stopped; the same command continues from here", file=sys.stderr)
@@ -334,7 +398,9 @@ def _exact(kind: type, accepts: tuple[type, ...]) -> Callable[[Any, type], Any]:
             with contextlib.suppress(ValueError):
                 value = float(value)
         if not isinstance(value, accepts) or (isinstance(value, bool) and kind is not bool):
-            raise TypeError(f"expected {kind.__name__}, found {type(value).__name__} {value!r}")
+            raise TypeError(f"expected {kind.__name__}, found {type(value).__name__} {shorten(value)}")
+        if isinstance(value, str) and ("\0" in value or (not value.isascii() and SURROGATES.search(value))):
+            raise ValueError(f"expected text without NUL characters and surrogates, found {shorten(value)}")
         return kind(value)
 
     return structure
@@ -342,17 +408,24 @@ def _exact(kind: type, accepts: tuple[type, ...]) -> Callable[[Any, type], Any]:
 
 def _structure_names(value: Any, kind: type) -> tuple[str, ...]:
     if isinstance(value, str) or not isinstance(value, Sequence):
-        raise TypeError(f"expected a list, found {type(value).__name__} {value!r}")
+        raise TypeError(f"expected a list, found {type(value).__name__} {shorten(value)}")
     return CONVERTER_OF_TUPLES.structure(value, kind)
+
+
+def _structure_path(value: Any, _: type) -> Path:
+    if not isinstance(value, (str, Path)):
+        raise TypeError(f"expected a path, found {type(value).__name__} {shorten(value)}")
+    if b"\0" in os.fsencode(value):
+        raise ValueError(f"expected a path without NUL characters, found {shorten(value)}")
+    return Path(value)
 
 
 def _reason(error: BaseException, kind: type | None) -> str:
     """Message of a structuring error: unknown keys with a suggestion, others as cattrs words them."""
     if isinstance(error, cattrs.ForbiddenExtraKeysError):
         known = [field.name for field in dataclasses.fields(error.cl)]
-        return " ".join(
-            f"unknown key {key!r};{suggestion(key, known)} known: {', '.join(known)}." for key in error.extra_fields
-        )
+        named = sorted(error.extra_fields, key=str)[:MOST_NAMED]
+        return " ".join(f"unknown key {shorten(key)};{suggestion(key, known)} known: {', '.join(known)}." for key in named)
     if isinstance(error, KeyError):
         return f"missing key {error.args[0]!r}."
     if dataclasses.is_dataclass(kind) and isinstance(error, TypeError):
@@ -370,6 +443,7 @@ def _converter() -> cattrs.Converter:
     converter = cattrs.Converter(forbid_extra_keys=True)
     for kind, accepts in ((bool, (bool,)), (int, (int,)), (float, (int, float)), (str, (str,))):
         converter.register_structure_hook(kind, _exact(kind, accepts))
+    converter.register_structure_hook(Path, _structure_path)
     converter.register_unstructure_hook(tuple, list)
     return converter
 

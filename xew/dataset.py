@@ -8,10 +8,11 @@ import time
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
+from fractions import Fraction
 from functools import cached_property
 from pathlib import Path
 
-from xew.episode import TEMPORARY, EpisodeError, Record, read_record
+from xew.episode import TEMPORARY, EpisodeError, Record, exact_rate, read_record
 from xew.protocol import MOTIONS, seed_split
 
 Episode = tuple[Path, Record]
@@ -144,6 +145,18 @@ def demand_one_motion(data: Path, records: Iterable[Record]) -> str:
     if len(counts) > 1:
         raise EpisodeError(f"{data} has {_list_motions(counts)}, which cannot be compared; keep them in separate data sets.")
     return next(iter(counts), MOTIONS[0])
+
+
+def demand_one_rate(data: Path, records: Iterable[Record]) -> Fraction:
+    """The frame rate [Hz] of episodes, of which there is at least one. Raises EpisodeError if they have several."""
+    counts = Counter(exact_rate(record.frame_rate) for record in records)
+    if len(counts) > 1:
+        rates = " and ".join(f"at {float(rate):.2f} ({count})" for rate, count in sorted(counts.items()))
+        raise EpisodeError(
+            f"{data} has episodes {rates} frames per second, which cannot be mixed; choose robots or tasks of one rate, or "
+            "keep them in separate data sets."
+        )
+    return next(iter(counts))
 
 
 def count_motions(records: Iterable[Record]) -> dict[str, int]:

@@ -11,16 +11,17 @@ Shape letters, here and everywhere: t frames, h w c image, j joints, a action, o
 Quaternions are x y z w; the world frame has its origin under the table's center, x right, y away from the robot, z up.
 """
 
+import contextlib
 import hashlib
+import io
 import itertools
 import json
-import math
 import os
 import secrets
 import shutil
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -31,10 +32,10 @@ import numpy as np
 
 from xew.concurrency import PARSING
 from xew.config import ConfigError, parse
-from xew.files import demand_regular, read_json, sweep
+from xew.files import LoadedFile, check_place, file_digest, load_file, read_json, sweep
 from xew.names import EpisodeError as EpisodeError
-from xew.names import check_label, check_name, folder_name, path_below
-from xew.protocol import MOTIONS, SHARED_MOTION
+from xew.names import check_label, check_name, folder_name, name_of_folder, path_below
+from xew.protocol import FRAME_RATE, MOTIONS, SHARED_MOTION
 
 SCHEMA_VERSION = 2
 WIDTH, HEIGHT = 320, 240
@@ -45,10 +46,34 @@ HELD = ("episode.json", "states.npz", "rgb.mkv", "robot.mkv")
 """Names of the files of an episode. A folder with any other file is never replaced."""
 SEED_END = 2**63
 """End of the range of seeds; tables store them in 64 bits."""
-FORMATS = "matroska,webm,mov,mp4,m4a,3gp,3g2,mj2"
+FORMATS = "matroska,webm,mov,mp4,m4a,3gp,3g2,mj2,avi"
 """Containers that are read, by FFmpeg's names. Others, such as playlists, may make FFmpeg open further files."""
+SLOWEST, FASTEST = 1.0, 1000.0
+"""Range of frame rates [Hz]."""
 TEMPORARY = ".writing-"
 """Prefix of the name of an incomplete folder."""
+UNPACKED_BYTES, UNPACKED_RATIO = 2**27, 100
+"""Largest size of the unpacked arrays of an .npz: a number of bytes, and this many times the size of the file."""
+MOST_PIXELS = 4096 * 4096
+"""Largest number of pixels of a frame of an episode's video."""
+PROBED_STREAMS = 8
+"""Number of streams of a container to which MOST_PIXELS applies while it is opened."""
+FORMS = {
+    "action": "float32 t 16",
+    "joint_pos": "float32 t 16",
+    "joint_vel": "float32 t 16",
+    "tool_pose": "float32 t 2 7",
+    "object_pose": "float32 t o 7",
+    "object_joint": "float32 t o",
+    "contact": "bool t 2 o",
+    "penetration": "float32 t o",
+    "keypoints": "float32 t k 2",
+    "keypoint_visible": "bool t k",
+    "robot_mask": "bool t h w",
+    "intrinsics": "float64 3 3",
+    "extrinsics": "float64 4 4",
+}
+"""Type and shape of each array of `States`."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +127,7 @@ class Record:
     """The failure in words."""
     instruction: str = ""
     frame_count: int = 0
-    frame_rate: float = 1000 / 60
+    frame_rate: float = FRAME_RATE
     object_names: tuple[str, ...] = ()
     keypoint_names: tuple[str, ...] = ()
     scene_hash: str = ""
@@ -120,6 +145,8 @@ class Record:
     """Whether rgb and robot are stored. If not, `python -m xew.sim_warp.inspect --render` renders them."""
     motion: str = SHARED_MOTION
     """Kind of motion, one of `xew.protocol.MOTIONS`."""
+    files: dict[str, str] = field(default_factory=dict)
+    """SHA-256 of the files as they were written, by name. The decoded bytes of such a file need not be compared."""
 
 
 def episode_folder(data: Path, task: str, seed: int, robot: str) -> Path:
@@ -174,7 +201,7 @@ def write_episode(
 
     Args:
         data: root of the data set.
-        record: the header; hashes are filled in here.
+        record: the header; hashes and digests of files are filled in here.
         states, rgb [t h w 3] uint8, robot [t h w 3] uint8: content of an accepted episode; None is not stored.
         videos: whether to store rgb and robot or only their hashes.
 
@@ -193,10 +220,12 @@ def write_episode(
                     hashes[name] = array_hash(video)
                     if videos:
                         write_video(temporary / f"{name}.mkv", video, record.frame_rate)
-            header = asdict(record) | {"hashes": hashes, "videos": videos}
-            (temporary / "episode.json").write_text(json.dumps(header, indent=1) + "\n")
+            written = {path.name: file_digest(path) for path in sorted(temporary.iterdir())}
+            header = asdict(record) | {"hashes": hashes, "files": written, "videos": videos}
+            (temporary / "episode.json").write_text(json.dumps(header, indent=1) + "\n", encoding="utf-8")
     except OSError as error:
-        raise EpisodeError(f"cannot write the episode {folder}: {error}. Free some space or choose another --out.") from error
+        reason = error.strerror or error  # without the temporary name
+        raise EpisodeError(f"cannot write the episode {folder}: {reason}. Free some space or choose another --out.") from error
     return folder
 
 
@@ -247,19 +276,26 @@ def _pack(states: States) -> dict[str, np.ndarray]:
 
 
 def read_record(folder: Path) -> Record:
-    """The header of an episode folder. Raises EpisodeError if it is missing or invalid."""
+    """The header of an episode folder. Raises EpisodeError if it is missing or invalid, or names another folder."""
     path = Path(folder) / "episode.json"
     try:
         header = read_json(path)
         version = header.get("schema_version") if isinstance(header, dict) else None
         if isinstance(version, int) and version != SCHEMA_VERSION:
             raise EpisodeError(f"{path} has schema version {version}, expected {SCHEMA_VERSION}; generate the data again.")
-        return _check_record(parse(Record, header, "its header"))
+        record = _check_record(parse(Record, header, "its header"))
     except FileNotFoundError as error:
         raise EpisodeError(f"{path} does not exist; `python -m xew.sim_warp.generate` makes episodes.") from error
     except (OSError, ValueError, ConfigError) as error:
         reason = "; ".join(str(error).splitlines())
         raise EpisodeError(f"{path} is damaged ({reason}); delete its folder and run generate again.") from error
+    own = f"{record.task}/{record.seed:07d}/{record.robot}"
+    if not f"/{name_of_folder(os.path.abspath(path.parent))}".endswith(f"/{own}"):
+        raise EpisodeError(
+            f"{path} is the header of {own}, in a folder that was copied or renamed; give the folder that name, or delete it "
+            "and run generate again."
+        )
+    return record
 
 
 def _check_record(record: Record) -> Record:
@@ -272,14 +308,14 @@ def _check_record(record: Record) -> Record:
         raise ValueError(str(error).rstrip(".")) from error
     if record.motion not in MOTIONS:
         raise ValueError(f"its motion is {record.motion!r}, expected {' or '.join(MOTIONS)}")
-    if not (math.isfinite(record.frame_rate) and record.frame_rate > 0 and record.frame_count >= 0):
+    if not SLOWEST <= record.frame_rate <= FASTEST or record.frame_count < 0:
         raise ValueError(f"it has {record.frame_count} frames at {record.frame_rate} a second")
     return record
 
 
-def demand_known(folder: Path, *names: str) -> None:
-    """Raise EpisodeError if one of these arrays of `States` is unknown in an imported episode."""
-    record = read_record(folder)
+def demand_known(folder: Path, *names: str, record: Record | None = None) -> None:
+    """Raise EpisodeError if one of these arrays of `States` is unknown in an imported episode; its header is read if None."""
+    record = record or read_record(folder)
     if missing := [name for name in names if name in record.unknown]:
         raise EpisodeError(
             f"{folder} was imported from {record.source}, which does not record {', '.join(missing)}; exclude it, or use "
@@ -287,27 +323,89 @@ def demand_known(folder: Path, *names: str) -> None:
         )
 
 
-def read_states(folder: Path) -> States:
-    """The recorded states of an accepted episode. Raises EpisodeError if they are missing or damaged."""
+def read_states(folder: Path, record: Record | None = None) -> States:
+    """The recorded states of an accepted episode.
+
+    Args:
+        folder: of the episode.
+        record: its header, which is read if None.
+
+    Raises:
+        EpisodeError: they are missing or damaged, or are not those of the header.
+    """
     path = Path(folder) / "states.npz"
     try:
-        arrays = read_npz(path)
+        file = load_file(path)
+        record = record or read_record(folder)
+        arrays = read_npz(file)
         arrays["robot_mask"] = np.unpackbits(arrays["robot_mask"], axis=-1).astype(bool)
-        return _check_camera(States(**arrays))
+        states = States(**arrays)
+        _check_states(states, record)
     except FileNotFoundError as error:
         raise EpisodeError(f"{path} does not exist: the cell was rejected or its folder is damaged.") from error
+    except EpisodeError:
+        raise
     except Exception as error:  # zipfile, zlib and NumPy each have their own
         raise EpisodeError(f"{path} is damaged ({error}); delete its folder and run generate again.") from error
-
-
-def _check_camera(states: States) -> States:
-    """The same states. Raises ValueError if their camera is invalid."""
-    intrinsics, extrinsics = states.intrinsics, states.extrinsics
-    if intrinsics.shape != (3, 3) or extrinsics.shape != (4, 4):
-        raise ValueError(f"its camera has intrinsics {intrinsics.shape} and extrinsics {extrinsics.shape}")
-    if not (np.isfinite(intrinsics).all() and np.isfinite(extrinsics).all() and intrinsics[0, 0] * intrinsics[1, 1] != 0):
-        raise ValueError("its camera has a focal length of 0, or numbers that are not finite")
+    if not _is_known(file, "states", record):
+        _compare(file, "states", record, states_hash(states))
     return states
+
+
+def _check_states(states: States, record: Record) -> None:
+    """Raise ValueError unless the arrays have their types, shapes and, where they are known, finite numbers."""
+    sizes = check_forms(vars(states), FORMS)
+    counts = {"t": record.frame_count, "o": len(record.object_names), "k": len(record.keypoint_names)}
+    for letter, what in (("t", "frames"), ("o", "objects"), ("k", "keypoints")):
+        if sizes[letter] != counts[letter]:
+            raise ValueError(f"it has {sizes[letter]} {what}, its header {counts[letter]}")
+    visible = {"keypoints": states.keypoints[states.keypoint_visible]}  # behind the camera they are NaN
+    for name in (name for name, form in FORMS.items() if form.startswith("float") and name not in record.unknown):
+        if not np.isfinite(visible.get(name, getattr(states, name))).all():
+            raise ValueError(f"{name} has NaN or infinite numbers")
+    if states.intrinsics[0, 0] * states.intrinsics[1, 1] == 0:
+        raise ValueError("its camera has a focal length of 0")
+
+
+def check_forms(arrays: Mapping[str, np.ndarray], forms: Mapping[str, str]) -> dict[str, int]:
+    """Check types and shapes of arrays, and return the sizes by shape letter.
+
+    Args:
+        arrays: [...] by name.
+        forms: type and shape by name, such as `float32 t 16`; a letter has one size in all arrays.
+
+    Raises:
+        ValueError: an array has another type or shape.
+    """
+    sizes: dict[str, int] = {}
+    for name, form in forms.items():
+        array, (dtype, *letters) = np.asarray(arrays[name]), form.split()
+        for letter, size in zip(letters, array.shape, strict=False):
+            sizes.setdefault(letter, int(letter) if letter.isdecimal() else size)
+        expected = [sizes.get(letter, letter) for letter in letters]
+        if array.dtype != dtype or list(array.shape) != expected:
+            raise ValueError(f"{name} is {array.dtype} {list(array.shape)}, expected {dtype} {expected}")
+    return sizes
+
+
+_COMPARED: set[tuple[str, str]] = set()
+"""Hashes of content that this process has compared, each with the digest of the file that held it."""
+
+
+def _is_known(file: LoadedFile, name: str, record: Record) -> bool:
+    """Whether a file is as it was written, or was compared before, so its content is that of the header."""
+    return record.files.get(file.path.name) == file.digest or (record.hashes.get(name, ""), file.digest) in _COMPARED
+
+
+def _compare(file: LoadedFile, name: str, record: Record, found: str) -> None:
+    """Remember the file if its content has the header's hash. Raises EpisodeError if not."""
+    expected = record.hashes.get(name, "")
+    if found != expected:
+        raise EpisodeError(
+            f"{file.path.parent}: {name} has hash {found[:12]}, expected {expected[:12] or 'none'} as in its header; it is "
+            "damaged or was exchanged. Delete the folder and run generate again."
+        )
+    _COMPARED.add((expected, file.digest))
 
 
 def project(points: np.ndarray, intrinsics: np.ndarray, extrinsics: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -331,14 +429,27 @@ def project(points: np.ndarray, intrinsics: np.ndarray, extrinsics: np.ndarray) 
     return focal * in_camera[..., :2] / front[..., None] + intrinsics[:2, 2], depth
 
 
-def read_npz(path: Path) -> dict[str, np.ndarray]:
-    """All arrays of an .npz by name [any shapes]; thread-safe. Raises the errors of zipfile, zlib and NumPy."""
-    # Opened here: np.load does not close a file that is no archive.
-    with PARSING, demand_regular(path).open("rb") as file, np.load(file) as stored:
+def read_npz(path: Path | LoadedFile) -> dict[str, np.ndarray]:
+    """All arrays of an .npz by name [any shapes]; thread-safe.
+
+    Raises the errors of zipfile, zlib and NumPy, and ValueError if it unpacks to far more bytes than it has.
+    """
+    content = load_file(path).content
+    with PARSING, np.load(io.BytesIO(content)) as stored:
+        unpacked = sum(entry.file_size for entry in stored.zip.infolist())
+        if unpacked > UNPACKED_BYTES + UNPACKED_RATIO * len(content):
+            raise ValueError(f"{len(content)} bytes unpack to {unpacked}")
         return {name: stored[name] for name in stored.files}
 
 
-def write_video(path: Path, video: np.ndarray, frame_rate: float = 1000 / 60) -> None:
+def exact_rate(frame_rate: float) -> Fraction:
+    """A frame rate [Hz] as the fraction that containers store. Raises EpisodeError unless it is from 1 to 1000."""
+    if not SLOWEST <= frame_rate <= FASTEST:
+        raise EpisodeError(f"the frame rate is {frame_rate:g}, expected {SLOWEST:g} to {FASTEST:g} frames per second.")
+    return Fraction(frame_rate).limit_denominator(1000)
+
+
+def write_video(path: Path, video: np.ndarray, frame_rate: float = FRAME_RATE) -> None:
     """Write uint8 RGB [t h w 3] losslessly: H.264 in RGB at quantizer 0, in Matroska.
 
     For these videos it takes a quarter of FFV1's time, at 1.3 times the size.
@@ -349,8 +460,7 @@ def write_video(path: Path, video: np.ndarray, frame_rate: float = 1000 / 60) ->
     height, width = video.shape[1:3]
     # bitexact: without random identifiers, equal frames give equal files
     with av.open(str(path), "w", format="matroska", container_options={"fflags": "+bitexact"}) as container:
-        rate = Fraction(frame_rate).limit_denominator(1000)
-        stream = container.add_stream("libx264rgb", rate=rate, options={"preset": "ultrafast", "qp": "0"})
+        stream = container.add_stream("libx264rgb", rate=exact_rate(frame_rate), options={"preset": "ultrafast", "qp": "0"})
         stream.width, stream.height, stream.pix_fmt = width, height, "rgb24"
         stream.codec_context.thread_count = 1  # several episodes are written in parallel
         for frame in video:
@@ -363,14 +473,16 @@ def encode_png(image: np.ndarray) -> bytes:
     return cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].tobytes()
 
 
-def open_video(path: Path) -> Any:
-    """Open a video as a PyAV container that reads no other file.
+def open_video(path: Path | LoadedFile) -> Any:
+    """Open a video, of which the whole file is read, as a PyAV container that reads no other file.
 
     Raises:
-        OSError: it is not a regular file. av.FFmpegError (an OSError, too): it is not Matroska or MP4.
+        OSError: it is not a regular file. av.FFmpegError (an OSError, too): it is not Matroska, MP4 or AVI.
     """
     options = {"format_whitelist": FORMATS, "protocol_whitelist": "file"}
-    return av.open(str(demand_regular(path).absolute()), container_options=options)
+    # FFmpeg decodes a frame of each stream to know it
+    probing: Any = [{"max_pixels": str(MOST_PIXELS)}] * PROBED_STREAMS
+    return av.open(io.BytesIO(load_file(path).content), container_options=options, stream_options=probing)
 
 
 def take_pixels(frame: av.VideoFrame, pixels: str = "rgb24") -> np.ndarray:
@@ -382,46 +494,80 @@ def take_pixels(frame: av.VideoFrame, pixels: str = "rgb24") -> np.ndarray:
     return frame.to_ndarray(format=pixels, threads=1)
 
 
-def read_video(path: Path, most: int | None = None) -> np.ndarray:
-    """A video, or its first `most` frames, as uint8 RGB [t h w 3]. Raises EpisodeError if it has no readable frame."""
+def read_pixels(folder: Path, name: str, most: int | None = None, record: Record | None = None) -> np.ndarray:
+    """The stored video rgb or robot of an episode, or its first `most` frames, as uint8 RGB [t h w 3].
+
+    A file as it was written is known by its digest. Another, of earlier data or encoded again, is decoded whole and compared
+    with the hash of its frames, once in a process.
+
+    Args:
+        folder: of the episode.
+        name: rgb or robot.
+        most: number of frames; None for all.
+        record: its header, which is read if None.
+
+    Raises:
+        EpisodeError: the video is missing or damaged, or is not that of the header.
+    """
+    file = _load_video(Path(folder) / f"{name}.mkv")
+    record = record or read_record(folder)
+    if _is_known(file, name, record):
+        video = read_video(file, most)
+    else:
+        video = read_video(file, record.frame_count + 1)
+        _compare(file, name, record, array_hash(video))
+    if len(video[:most]) != len(range(record.frame_count)[:most]):
+        raise EpisodeError(f"{file} has {len(video)} frames, its header says {record.frame_count}; run generate again.")
+    return video[:most]
+
+
+def read_video(path: Path | LoadedFile, most: int | None = None) -> np.ndarray:
+    """A video, or its first `most` frames, as uint8 RGB [t h w 3]. Raises EpisodeError if it is missing or damaged."""
+    file = _load_video(path)
     try:
-        with open_video(path) as container:
-            container.streams.video[0].codec_context.thread_count = 1
-            frames = [take_pixels(frame) for frame in itertools.islice(container.decode(video=0), most)]
-    except (av.FFmpegError, OSError, IndexError):  # IndexError: a file without a video in it
-        frames = []
-    if not frames:
+        with open_video(file) as container:
+            decoder = container.streams.video[0].codec_context
+            if decoder.width * decoder.height > MOST_PIXELS:
+                raise ValueError(f"frames of {decoder.width}x{decoder.height} pixels")
+            decoder.thread_count = 1
+            decoder.options = {"err_detect": "explode"}  # otherwise FFmpeg conceals what is damaged
+            return np.stack([take_pixels(frame) for frame in itertools.islice(container.decode(video=0), most)])
+    except (av.FFmpegError, OSError, ValueError, IndexError, MemoryError) as error:  # IndexError: a file without a video in it
+        reason = getattr(error, "strerror", None) or error
         raise EpisodeError(
-            f"{path} is missing or holds no readable frame. For data made with --states-only, run "
-            f"`python -m xew.sim_warp.inspect DATA --render`; otherwise delete its folder and run generate again."
-        )
-    return np.stack(frames)
+            f"{file} is damaged: it holds no readable frame, or only some ({reason}); delete its folder and run generate again."
+        ) from error
+
+
+def _load_video(path: Path | LoadedFile) -> LoadedFile:
+    try:
+        return load_file(path)
+    except OSError as error:
+        raise EpisodeError(
+            f"{path} is missing or cannot be read ({error.strerror}). For data made with --states-only, run "
+            "`python -m xew.sim_warp.inspect DATA --render`; otherwise delete its folder and run generate again."
+        ) from error
 
 
 def verify_episode(folder: Path) -> Record:
-    """Read an accepted episode and compare it with its hashes. Raises EpisodeError at the first difference."""
-    folder = Path(folder)
+    """Read all of an accepted episode and compare it with its hashes. Raises EpisodeError at the first difference."""
     record = read_record(folder)
-    readers = {
-        "states": lambda: states_hash(read_states(folder)),
-        "rgb": lambda: array_hash(read_video(folder / "rgb.mkv")),
-        "robot": lambda: array_hash(read_video(folder / "robot.mkv")),
-    }
-    stored = {name: expected for name, expected in record.hashes.items() if record.videos or name == "states"}
-    for name, expected in stored.items():
-        if name not in readers:
+    decoded = replace(record, files={})  # so the content is compared, not the files that hold it
+    for name in record.hashes:
+        if name not in ("states", "rgb", "robot"):
             raise EpisodeError(
-                f"{folder} names a hash of {name!r}, expected {', '.join(readers)}; delete it and run generate again."
+                f"{folder} names a hash of {name!r}, expected states, rgb, robot; delete it and run generate again."
             )
-        digest = readers[name]()
-        if digest != expected:
-            raise EpisodeError(
-                f"{folder}: {name} has hash {digest[:12]}, expected {expected[:12]}; delete it and run generate again."
-            )
+        if name == "states":
+            read_states(folder, decoded)
+        elif record.videos:
+            read_pixels(folder, name, record=decoded)
     return record
 
 
 def remove_left_overs(data: Path) -> None:
-    """Remove incomplete episodes and robots of killed runs."""
+    """Remove incomplete episodes and robots of killed runs, except where links lead."""
     for folder in [*Path(data).glob(f"*/*/{TEMPORARY}*"), *Path(data).glob(f"*/{TEMPORARY}*")]:
-        shutil.rmtree(folder, ignore_errors=True)
+        with contextlib.suppress(OSError):
+            check_place(folder / "file", within=Path(data))
+            shutil.rmtree(folder, ignore_errors=True)

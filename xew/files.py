@@ -1,4 +1,8 @@
-"""File operations for all packages: read regular files, write files atomically, lock, remove and digest them."""
+"""File operations for all packages: read regular files, write files atomically, lock, remove and digest them.
+
+Every file is written by `replacing`, `write_text`, `write_bytes` or `open_own`, or into a new folder of
+`xew.episode.complete_folder`. They create files under random names and follow no link below the folder that the user named.
+"""
 
 import contextlib
 import errno
@@ -9,6 +13,7 @@ import hashlib
 import json
 import os
 import re
+import secrets
 import shutil
 import socket
 import stat
@@ -16,15 +21,19 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, Literal
 
-from xew.names import EpisodeError
+from xew.names import EpisodeError, demand_utf8, shorten
 
 POLL_S = 0.2
 """Interval at which a lock that another process holds is polled [s]."""
 SETTLED_S = 2.0
 """Age above which a temporary file whose process does not run on this machine counts as abandoned [s]."""
+UNIQUE = "(-[0-9a-f]+)?"
+"""Pattern of the random end of a temporary name."""
 KINDS = {stat.S_IFIFO: "a FIFO", stat.S_IFSOCK: "a socket", stat.S_IFCHR: "a device", stat.S_IFBLK: "a device"}
 """Names of the file types that are neither regular files nor folders, by their mode bits."""
 
@@ -52,24 +61,114 @@ def read_text(path: Path) -> str:
 def read_json(path: Path) -> Any:
     """The content of a JSON file. Raises OSError as `demand_regular`, ValueError if it is not valid JSON in UTF-8."""
     try:
-        return json.loads(read_text(path))
+        return parse_json(read_text(path))
     except RecursionError as error:
         raise ValueError("it is nested too deeply") from error
 
 
-@contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """Yield a temporary name next to `path`; the file is renamed to `path` if the block succeeds.
+@dataclass(frozen=True)
+class LoadedFile:
+    """A file in memory, so what is digested is what is decoded, even if the file is replaced meanwhile."""
 
-    Readers of `path` see the old file or the new one. Parent folders are created. Temporary files of a failed block or of a
-    killed process are removed.
+    path: Path
+    content: bytes = field(repr=False)
+
+    def __str__(self) -> str:
+        return str(self.path)
+
+    @cached_property
+    def digest(self) -> str:
+        """Hexadecimal SHA-256."""
+        return hashlib.sha256(self.content).hexdigest()
+
+
+def load_file(path: "Path | LoadedFile") -> LoadedFile:
+    """Read a file, unless it is in memory. Raises OSError as `demand_regular`."""
+    return path if isinstance(path, LoadedFile) else LoadedFile(Path(path), demand_regular(path).read_bytes())
+
+
+def parse_json(text: str | bytes) -> Any:
+    """The content of a JSON text. Raises ValueError if it is not JSON or has a key twice, RecursionError."""
+    return json.loads(text, object_pairs_hook=_demand_unique)
+
+
+def _demand_unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    content = dict(pairs)
+    if len(content) < len(pairs):
+        keys = [key for key, _ in pairs]
+        raise ValueError(f"it has the key {shorten(next(key for key in keys if keys.count(key) > 1))} twice")
+    return content
+
+
+def check_place(path: Path, *, within: Path) -> None:
+    """Raise OSError unless a file can be written at a path that follows no link below a folder.
+
+    Args:
+        path: the file, which may not exist yet.
+        within: folder that the user named, which may be a link itself.
+    """
+    folder = within
+    for name in path.relative_to(within).parts[:-1]:
+        folder = folder / name
+        if folder.is_symlink():
+            raise OSError(
+                errno.ELOOP,
+                f"is a link, and no link below {within} is followed to write: put the folder itself there",
+                str(folder),
+            )
+    if path.exists():
+        demand_regular(path)
+
+
+def demand_no_links(folder: Path) -> None:
+    """Raise OSError if a folder that is to be written holds a link, at any depth."""
+    for parent, folders, files in os.walk(folder):
+        for path in (Path(parent, name) for name in (*folders, *files)):
+            if path.is_symlink():
+                raise OSError(
+                    errno.ELOOP,
+                    f"is a link, and no link below {folder} is followed to write: put the file or folder itself there",
+                    str(path),
+                )
+
+
+def open_own(path: Path, mode: Literal["x", "a", "a+"]) -> IO[str]:
+    """Open a text file for writing; x creates it.
 
     Raises:
-        OSError: the file cannot be written, or the disk is full.
+        OSError: the path is a link or no regular file, or with x exists.
     """
+    return open(path, mode, encoding="utf-8", opener=_open_regular)
+
+
+def _open_regular(path: str, flags: int) -> int:
+    """Open a file without following a link or waiting for the reader of a FIFO, and return its descriptor."""
+    descriptor = os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, 0o666)
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        demand_regular(Path(path))
+    return descriptor
+
+
+@contextmanager
+def replacing(path: Path, *, within: Path) -> Iterator[Path]:
+    """Yield the name of a new, empty file next to `path`, which is renamed to `path` if the block succeeds.
+
+    Readers of `path` see the old file or the new one. Parent folders are created. Temporary files of a failed block or of a
+    killed process are removed. A link at `path` itself is replaced.
+
+    Args:
+        path: the file to write.
+        within: folder that the user named, below which no link is followed.
+
+    Raises:
+        OSError: as `check_place`, the file cannot be written, or the disk is full.
+    """
+    check_place(path, within=within)
     path.parent.mkdir(parents=True, exist_ok=True)
-    sweep(path)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    sweep(path, ending=UNIQUE)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}")
+    open_own(temporary, "x").close()
     try:
         yield temporary
         os.replace(temporary, path)
@@ -77,16 +176,29 @@ def replacing(path: Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
-def write_text(path: Path, text: str) -> None:
+def write_text(path: Path, text: str, *, within: Path) -> None:
     """Write a UTF-8 file atomically. Raises OSError as `replacing`."""
-    with replacing(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    write_bytes(path, text.encode("utf-8", "backslashreplace"), within=within)  # of names that are not UTF-8
 
 
-def write_bytes(path: Path, content: bytes) -> None:
+def write_bytes(path: Path, content: bytes, *, within: Path) -> None:
     """Write a file atomically. Raises OSError as `replacing`."""
-    with replacing(path) as temporary:
+    with replacing(path, within=within) as temporary:
         temporary.write_bytes(content)
+
+
+def copy_file(source: Path, path: Path, *, within: Path) -> None:
+    """Copy a regular file atomically, with its times. Raises OSError as `replacing`."""
+    with replacing(path, within=within) as temporary:
+        shutil.copy2(demand_regular(source), temporary)
+
+
+def copy_tree(source: Path, folder: Path, *, within: Path) -> None:
+    """Copy the files of a folder into another, without links and hidden files. Raises OSError as `replacing`."""
+    for path in sorted(source.rglob("*")):
+        name = path.relative_to(source)
+        if path.is_file() and not path.is_symlink() and not any(part.startswith(".") for part in name.parts):
+            copy_file(path, folder / name, within=within)
 
 
 def sweep(path: Path, prefix: str = ".", ending: str = "") -> None:
@@ -147,16 +259,23 @@ def hold_lock(path: Path, *, wait: bool = False) -> Iterator[None]:
     """Lock a folder or file that a command writes, until the block or the process ends.
 
     The lock file `.NAME.lock` next to it names the holder and is removed with the lock. No lock is taken where the file system
-    has none or the lock file cannot be written.
+    has none or the lock file cannot be written. An output that is neither a regular file nor a folder is refused here.
 
     Args:
         path: the folder or file to lock.
         wait: wait for another holder, announced once on stderr.
 
     Raises:
-        EpisodeError: another process, named in the message, holds the lock and `wait` is false.
+        EpisodeError: another process, named in the message, holds the lock and `wait` is false, the lock is a link, or the
+            path is not UTF-8.
+        OSError: the output is a device, a FIFO, a socket or the root of the file system.
     """
     path = path.absolute()
+    demand_utf8(path)
+    if not path.name:
+        raise IsADirectoryError(errno.EISDIR, "is the root of the file system, expected a folder or file below it", str(path))
+    if path.exists() and not path.is_dir():
+        demand_regular(path)
     lock_file, announced = path.with_name(f".{path.name}.lock"), False
     while True:
         try:
@@ -180,9 +299,11 @@ def hold_lock(path: Path, *, wait: bool = False) -> Iterator[None]:
 def _lock(path: Path, lock_file: Path) -> IO[str] | None:
     """The open locked file; None where locks are not possible. Raises EpisodeError as `hold_lock`."""
     while True:
+        if lock_file.is_symlink() or (lock_file.exists() and not lock_file.is_file()):
+            raise EpisodeError(f"{lock_file} is a link or no regular file, and so no lock of xew; remove it.")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            file = lock_file.open("a+", encoding="utf-8")
+            file = open_own(lock_file, "a+")
         except OSError:
             return None
         try:
@@ -215,7 +336,11 @@ def file_digest(path: Path) -> str:
 
 def digest_files(paths: Sequence[Path]) -> str:
     """SHA-256 of one file, or of the digests of several in order. Raises OSError if one cannot be read."""
-    digests = [file_digest(path) for path in paths]
+    return join_digests([file_digest(path) for path in paths])
+
+
+def join_digests(digests: Sequence[str]) -> str:
+    """The digest of one file, or the SHA-256 of the digests of several."""
     return digests[0] if len(digests) == 1 else hashlib.sha256(b"".join(map(bytes.fromhex, digests))).hexdigest()
 
 

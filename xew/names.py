@@ -1,10 +1,11 @@
 """Names, paths and texts from files of unknown origin: data sets, rollouts, runs and score tables.
 
 A name from such a file becomes part of a path only through `check_name` and `path_below`. A text enters Markdown or CSV only
-through `plain_markdown` or `csv_text`.
+through `plain_markdown` or `csv_text`, and a message only through a `UserError`.
 """
 
 import re
+import reprlib
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -13,7 +14,12 @@ NAME = re.compile(r"\w[\w.+-]*(?::[^\W\d]\w*)?")
 MOST_LETTERS = 200
 """Largest length of a name [bytes]; file systems take 255 with an ending."""
 SHOWN_LETTERS = 80
-"""Largest number of letters of an invalid name in a message."""
+"""Largest number of letters of an invalid name or value in a message."""
+LONGEST_LINE = 2000
+"""Largest number of letters of a line of a message."""
+MOST_LINES = 100
+"""Largest number of lines of a message."""
+LINE_ENDS = re.compile(r"\s*[\r\n]+\s*")
 ACTIVE_TAG = re.compile(
     r"<(?=[A-Za-z/!?])(?!(?!base|embed|form|iframe|link|math|meta|object|plaintext|script|style|svg|template|textarea|title|xmp)"
     r"[a-z]+>)"
@@ -21,7 +27,19 @@ ACTIVE_TAG = re.compile(
 """Beginnings of HTML tags in Markdown, except formatting tags without attributes."""
 
 
-class EpisodeError(Exception):
+class UserError(Exception):
+    """A mistake of the user or in a file, with the remedy.
+
+    Each argument is a line of the message, see `plain_line`.
+    """
+
+    def __str__(self) -> str:
+        lines = [plain_line(str(line)) for line in self.args[:MOST_LINES]]
+        more = len(self.args) - MOST_LINES
+        return "\n".join(lines + ([f"and {more} more"] if more > 0 else []))
+
+
+class EpisodeError(UserError):
     """An episode or a file that belongs to one is missing or invalid; the message says what to do."""
 
 
@@ -33,7 +51,7 @@ def check_name(name: object, what: str) -> str:
     """
     if not isinstance(name, str) or not NAME.fullmatch(name) or len(name.encode()) > MOST_LETTERS:
         raise EpisodeError(
-            f"the {what} is {_shorten(name)}, expected a key of letters, digits, _, -, + and dots, or module:NAME; correct it "
+            f"the {what} is {shorten(name)}, expected a key of letters, digits, _, -, + and dots, or module:NAME; correct it "
             "in its file, or remove the file."
         )
     return name
@@ -56,9 +74,9 @@ def check_label(text: object, what: str) -> str:
         EpisodeError: it is not printable text, or is a path that leads out of its folder.
     """
     if not isinstance(text, str) or not text.isprintable() or len(text) > MOST_LETTERS:
-        raise EpisodeError(f"the {what} is {_shorten(text)}, expected printable text of at most {MOST_LETTERS} letters.")
+        raise EpisodeError(f"the {what} is {shorten(text)}, expected printable text of at most {MOST_LETTERS} letters.")
     if text.startswith(("/", "~")) or "\\" in text or ".." in PurePosixPath(text).parts:
-        raise EpisodeError(f"the {what} is {_shorten(text)}, a path that leads out of its folder; give it a plain name.")
+        raise EpisodeError(f"the {what} is {shorten(text)}, a path that leads out of its folder; give it a plain name.")
     return text
 
 
@@ -78,9 +96,32 @@ def path_below(root: Path, *names: str) -> Path:
     return path
 
 
-def _shorten(name: object) -> str:
-    text = repr(name)
+def demand_utf8(path: Path) -> None:
+    """Raise EpisodeError if a path is not UTF-8, for Arrow, Orbax and TensorBoard open no others."""
+    try:
+        str(path).encode()
+    except UnicodeEncodeError as error:
+        raise EpisodeError(f"the path {path} is not UTF-8; rename the folder or file.") from error
+
+
+def shorten(value: object) -> str:
+    """The beginning of the `repr` of a value of any size."""
+    text = _SHORT.repr(value)
     return text if len(text) <= SHOWN_LETTERS else f"{text[:SHOWN_LETTERS]}…"
+
+
+_SHORT = reprlib.Repr()
+_SHORT.maxlevel, _SHORT.maxstring, _SHORT.maxother = 3, 10 * SHOWN_LETTERS, 10 * SHOWN_LETTERS
+
+
+def plain_line(text: str) -> str:
+    """Text as one line of at most LONGEST_LINE letters; control characters and surrogates become escapes such as \\x1b."""
+    text = LINE_ENDS.sub(" ", text)
+    if len(text) > LONGEST_LINE:
+        text = f"{text[: LONGEST_LINE - 500]} … {text[-400:]}"  # the remedy stands at the end
+    if text.isprintable():
+        return text
+    return "".join(letter if letter.isprintable() else letter.encode("unicode_escape").decode() for letter in text)
 
 
 def plain_markdown(text: str) -> str:

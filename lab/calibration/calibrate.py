@@ -30,7 +30,7 @@ from lab.calibration.perturbations import Perturbation, render_perturbations
 from lab.calibration.predictors import APPEARANCES, PREDICTORS, Material, predict
 from xew.config import ConfigError, admit, suggestion, user_errors
 from xew.dataset import demand_one_motion, find_accepted
-from xew.episode import EpisodeError, Record, read_video
+from xew.episode import EpisodeError, Record, read_pixels
 from xew.files import hold_lock, replacing, write_text
 from xew.metrics import METRICS
 from xew.metrics.backends import Masker, Tracker, open_masker, open_tracker
@@ -217,7 +217,7 @@ def reference_videos(
     for differs in ("robot", "seed"):
         folder = find_another(episodes, record, differs)
         if folder is not None:
-            video = read_video(folder / "rgb.mkv")
+            video = read_pixels(folder, "rgb")
             yield f"another {differs}", video[np.minimum(frames, len(video) - 1)]
 
 
@@ -358,9 +358,9 @@ def write(out: Path, text: str, tables: dict[str, pd.DataFrame], name: str = "ca
     """Write a text of this name and tables. Raises EpisodeError if the folder cannot be written."""
     try:
         out.mkdir(parents=True, exist_ok=True)
-        write_text(out / name, text)
+        write_text(out / name, text, within=out)
         for key, table in tables.items():
-            with replacing(out / f"{key}.parquet") as temporary:
+            with replacing(out / f"{key}.parquet", within=out) as temporary:
                 table.to_parquet(temporary, index=False)
     except OSError as error:
         raise EpisodeError(f"cannot write the tables to {out}: {error}; choose another --out.") from error

@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from lab.calibration.predictors import PREDICTORS, Material, predict, render_material
-from xew.episode import Record, read_video
+from xew.episode import Record, read_pixels
 from xew.metrics import METRICS
 from xew.metrics.backends import Masker, Tracker
 from xew.metrics.episode_cache import EpisodeCache
@@ -91,7 +91,7 @@ def grade_predictors(
         cases: names of PREDICTORS.
     """
     truth = read_truth(folder, record.frame_count, {input_kind(name) for name in metrics} | {"bodies"})
-    other_robot = None if other is None else _cut(read_video(other / "rgb.mkv"), truth)
+    other_robot = None if other is None else _cut(read_pixels(other, "rgb"), truth)
     rendered = render_material(folder, cases)
     material = Material(truth.rgb, other_robot, robot=truth.labels == 0, objects=truth.labels > 0, **rendered)
     key = {"task": record.task, "seed": record.seed, "robot": record.robot}

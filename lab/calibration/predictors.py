@@ -16,7 +16,7 @@ import numpy as np
 
 from lab.calibration.perturbations import render_perturbation
 from xew.episode import States, read_states, take_pixels
-from xew.metrics.grading.list_jobs import SOFTNESS
+from xew.metrics.grading.grade_episodes import SOFTNESS
 from xew.metrics.truth import MOVED
 from xew.protocol import ARMS
 

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from lab.codec.pictures import Pictures, gather_pictures, read_frames
+from lab.codec.pictures import Pictures, gather_pictures
 from lab.codec.report import measure_codec, report_rows, report_scalars, write_report
 from lab.codec.sampling import Batches, place_pictures
 from lab.codec.settings import (
@@ -35,13 +35,14 @@ from xew.command_line import parse_command
 from xew.compilation import keep_compiled_programs
 from xew.config import load, user_errors
 from xew.dataset import Dataset, Episode, read_dataset
+from xew.episode import read_pixels
 from xew.files import file_digest, hold_lock, write_text
 from xew.model.codecs.autoencoders import ConvAutoencoderCodec
 from xew.model.codecs.ceiling import check_lpips
 from xew.model.codecs.contract import to_pictures, to_signed
 from xew.model.codecs.conv_autoencoder import ConvAutoencoder, save_weights
 from xew.model.runs.checkpoint import TrainState, restore_state
-from xew.model.runs.folder import check_one_of, claim_run
+from xew.model.runs.folder import check_episodes, check_one_of, claim_run, write_episodes
 from xew.model.runs.log import RunLog
 from xew.model.runs.session import open_session
 from xew.model.training.loop import STOPPED, Meter, Timetable, run_steps
@@ -84,7 +85,10 @@ def train_codec(experiment: CodecExperiment, *, resume: bool = False, overwrite:
     settings = experiment.train
     dataset = read_dataset(experiment.data)
     episodes = unpaired_training_episodes(dataset, experiment.train_robots, experiment.motion)
+    if resume:
+        check_episodes(experiment.out, episodes)
     claim_run(experiment.out, experiment, load_codec_experiment, resume=resume, overwrite=overwrite)
+    write_episodes(experiment.out, episodes)
     pictures = load_pictures(experiment, episodes)
     batches = Batches(pictures, experiment.streams, settings)
     print(f"{'device' if batches.on_device else 'host'} memory: {pictures.describe()}")
@@ -107,7 +111,7 @@ def train_codec(experiment: CodecExperiment, *, resume: bool = False, overwrite:
                 steps,
                 settings.log_every,
                 settings.save_every,
-                settings.sample_every,
+                range(settings.sample_every, steps + 1, settings.sample_every) if settings.sample_every else (),
                 batches.rate,
                 batches.is_over if settings.seconds else None,
             )
@@ -136,8 +140,8 @@ def sample_picture(module: ConvAutoencoder, episode: Episode, experiment: CodecE
     folder, record = episode
     cut = experiment.cut
     times = np.minimum(np.arange(cut.frames), record.frame_count - 1)
-    frames = read_frames(folder / "rgb.mkv", set(times.tolist()))
-    clip = to_model_size(np.stack([frames[int(time)] for time in times]), cut.height, cut.width)
+    frames = read_pixels(folder, "rgb", cut.frames, record)
+    clip = to_model_size(frames[times], cut.height, cut.width)
     return strip(clip, np.asarray(reconstruct_clip(module, clip)))
 
 
@@ -181,7 +185,7 @@ def finish(
 def write_description(experiment: CodecExperiment, description: dict[str, Any]) -> None:
     """Write autoencoder.json next to the weights."""
     path = experiment.out / "autoencoder.json"
-    write_text(path, json.dumps(description, indent=1) + "\n")
+    write_text(path, json.dumps(description, indent=1) + "\n", within=path.parent)
 
 
 def latent_statistics(module: ConvAutoencoder, batches: Batches, count: int) -> tuple[jax.Array, jax.Array]:

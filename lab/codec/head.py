@@ -31,7 +31,7 @@ from jax import Array
 from xew.compilation import keep_compiled_programs
 from xew.concurrency import map_in_order, usable_cores
 from xew.dataset import Episode, read_dataset
-from xew.episode import episode_folder, read_video
+from xew.episode import episode_folder, read_pixels
 from xew.metrics import lpips
 from xew.model.codecs.autoencoders import ConvAutoencoderCodec
 from xew.model.codecs.contract import CodecSettings, GivenFrames, given_frames, to_signed
@@ -40,6 +40,7 @@ from xew.model.codecs.render_head import HeadSize, RenderHead, robot_pixels
 from xew.model.codecs.vae_layers import as_row
 from xew.model.video.frames import TEMPORAL_FACTOR, padding_to
 from xew.protocol import expand_robots, seed_split
+from xew.rollout import read_rollout, read_rollout_video
 
 HEIGHT, WIDTH = 256, 320
 """Size of the frames that the head works on [pixels], as of configs/fixed.yaml."""
@@ -149,8 +150,8 @@ def _pack_episode(args: Pack, number: int, episode: Episode, offset: int) -> Non
     """Write the groups of one episode behind those of the episodes before."""
     folder, record = episode
     arrays = {path.stem: np.load(path, mmap_mode="r+") for path in args.out.glob("*.npy") if path.stem != "episode"}
-    truth, render = read_video(folder / "rgb.mkv"), read_video(folder / "robot.mkv")
-    predicted = read_video(_rollout(args, record) / "rgb.mkv") if args.rollouts is not None else None
+    truth, render = (read_pixels(folder, name, record=record) for name in ("rgb", "robot"))
+    predicted = read_rollout_video(read_rollout(_rollout(args, record))) if args.rollouts is not None else None
     arrays["first"][number] = truth[:1]
     for row, start in enumerate(list_starts(record.frame_count, record.seed, args.every), offset):
         arrays["truth"][row] = truth[start : start + TEMPORAL_FACTOR]
@@ -312,7 +313,7 @@ Command = Annotated[Pack, tyro.conf.subcommand("pack")] | Annotated[Train, tyro.
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Pack groups, or train a head."""
-    args = tyro.cli(Command, args=arguments, description=(__doc__ or "").splitlines()[0])  # type: ignore[arg-type]
+    args = tyro.cli(Command, args=arguments, description=(__doc__ or "").splitlines()[0])
     pack(args) if isinstance(args, Pack) else train(args)
 
 

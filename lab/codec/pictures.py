@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import av
 import numpy as np
 from jaxtyping import Bool, Integer, UInt8
 from tqdm import tqdm
@@ -21,14 +20,14 @@ from tqdm import tqdm
 from xew.concurrency import map_in_order
 from xew.config import ConfigError
 from xew.dataset import Episode
-from xew.episode import EpisodeError, Record, open_video, read_states, take_pixels
+from xew.episode import Record, read_pixels, read_states
 from xew.model import conditions
 from xew.model.cache.clips import take_frames
 from xew.model.conditions import make_command
 from xew.model.video.frames import TEMPORAL_FACTOR, to_model_size
 
-STORED = {"rgb": "rgb.mkv", "robot_render": "robot.mkv"}
-"""Streams that are files of an episode."""
+STORED = {"rgb": "rgb", "robot_render": "robot"}
+"""Streams that are videos of an episode, with their names there."""
 DRAWN = {"optical_flow": conditions.optical_flow, "mask": conditions.robot_mask, "ray_map": conditions.ray_map}
 """Streams that are drawn from an episode's commands."""
 ALIGNED = (*STORED, *DRAWN)
@@ -167,13 +166,12 @@ def read_aligned(
         EpisodeError: a video is missing or damaged.
     """
     drawn = any(name in DRAWN for name in streams)
-    states = read_states(folder) if drawn or regions else None
+    states = read_states(folder, record) if drawn or regions else None
     command = make_command(folder, record, states) if states is not None and drawn else None
     chosen, pairs = np.asarray(times), {}
     for name in streams:
         if name in STORED:
-            frames = read_frames(folder / STORED[name], set(times))
-            video = np.stack([frames[time] for time in times])
+            video = read_pixels(folder, STORED[name], int(chosen.max()) + 1, record)[chosen]
         else:
             assert command is not None
             video = DRAWN[name](command)[chosen]
@@ -226,24 +224,3 @@ def mask_to_model_size(mask: Masks, cut: Cut) -> Bool[np.ndarray, "t y x"]:
     """Resize masks [t 240 320] bool to the model's size [t height width]."""
     pictures = to_model_size(mask[..., None].astype(np.uint8) * 255, cut.height, cut.width)
     return pictures.reshape(len(mask), cut.height, cut.width) > 127
-
-
-def read_frames(path: Path, wanted: set[int]) -> dict[int, np.ndarray]:
-    """Read frames of a video by index, each uint8 [h w 3]. Raises EpisodeError if it does not hold them."""
-    frames: dict[int, np.ndarray] = {}
-    try:
-        with open_video(path) as container:
-            container.streams.video[0].codec_context.thread_count = 1
-            for number, frame in enumerate(container.decode(video=0)):
-                if number in wanted:
-                    frames[number] = take_pixels(frame)
-                if len(frames) == len(wanted):
-                    break
-    except (av.FFmpegError, OSError, IndexError):
-        frames = {}
-    if len(frames) < len(wanted):
-        raise EpisodeError(
-            f"{path} is missing, damaged or shorter than its episode; make its videos with `python -m xew.sim_warp.inspect DATA"
-            " --render`, or delete the episode and generate it again."
-        )
-    return frames

@@ -125,7 +125,7 @@ def grade(codec: Codec, truth: Truth, clip: Clip, sheet: Path | None = None) -> 
 
 def write_sheet(path: Path, truth: UInt8[np.ndarray, "t h w 3"], decoded: UInt8[np.ndarray, "t h w 3"]) -> None:
     """Write a few frames of two videos [t h w 3] as a picture, ground truth above reconstruction."""
-    write_bytes(path, encode_png(strip(truth, decoded)))
+    write_bytes(path, encode_png(strip(truth, decoded)), within=path.parent)
 
 
 def write_report(qualities: Sequence[Quality], experiment: CodecExperiment) -> str:
@@ -142,7 +142,7 @@ def write_report(qualities: Sequence[Quality], experiment: CodecExperiment) -> s
         mark = " *" if q.trained else ""
         lines.append(f"| {q.robot}{mark} | {q.stream} | {q.psnr:.2f} | {q.lpips:.4f} | {region} | {q.clips} |")
     text = "\n".join((*lines, "", *spread_lines(qualities))) + "\n"
-    write_text(experiment.out / "report.md", text)
+    write_text(experiment.out / "report.md", text, within=experiment.out)
     return text
 
 

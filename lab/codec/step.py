@@ -178,4 +178,4 @@ def summarize(results: Sequence[Losses]) -> dict[str, float]:
     """Means of the parts of the loss over some steps."""
     names = [name for name in Losses._fields if name != "finite"]
     means = {name: float(np.mean([getattr(result, name) for result in results])) for name in names}
-    return {"train/loss": means.pop("total")} | {f"train/{name}": value for name, value in means.items()}
+    return {"loss/train": means.pop("total")} | {f"train/{name}": value for name, value in means.items()}

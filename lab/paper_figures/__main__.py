@@ -47,7 +47,7 @@ class Args:
 def main(args: Args) -> None:
     """Print the sentences and write the page."""
     sentences, page = describe(read_paper())
-    write_text(args.out, page)
+    write_text(args.out, page, within=args.out.parent)
     print("\n".join([*sentences, str(args.out)]))
 
 

@@ -236,7 +236,7 @@ def fill_catalog(args: Args) -> None:
         for number, problem, entry in replace_failing(entries, args.workers):
             print(f"body:{number} is replaced by candidate {entry.candidate}: {problem}")
             entries[number] = entry
-            write_bytes(args.out, catalog_text(entries).encode())
+            write_bytes(args.out, catalog_text(entries).encode(), within=args.out.parent)
     with tqdm(total=args.count, initial=len(entries), desc="bodies", unit="body") as bar:
         for number, result in find_bodies(tuple(entries), args.count, args.workers):
             if isinstance(result, str):
@@ -244,7 +244,7 @@ def fill_catalog(args: Args) -> None:
                 bar.write(f"candidate {number} is skipped: {result}")
                 continue
             entries.append(result)
-            write_bytes(args.out, catalog_text(entries).encode())
+            write_bytes(args.out, catalog_text(entries).encode(), within=args.out.parent)
             bar.update()
     print(f"{args.out}: {len(entries)} bodies; {skipped} candidates were skipped")
 

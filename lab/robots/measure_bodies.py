@@ -274,8 +274,8 @@ def run_everything(args: Everything) -> int:
         "distances": [*this, "distances", "--plot", str(args.out / "body_distances.png")],
     }.items():
         begin = time.perf_counter()
-        done = subprocess.run(command, stdout=subprocess.PIPE, text=True)
-        (args.out / f"{name}.txt").write_text(done.stdout)
+        done = subprocess.run(command, stdout=subprocess.PIPE, encoding="utf-8")
+        (args.out / f"{name}.txt").write_text(done.stdout, encoding="utf-8")
         print(f"{done.stdout}{name}: {time.perf_counter() - begin:.0f} s, exit code {done.returncode}\n", flush=True)
         failed += done.returncode != 0
     return failed

@@ -94,7 +94,7 @@ def write_references(robot: RobotSpec, folder: Path) -> Path:
     for index, image in enumerate(nine_views(robot)):
         save(own / f"view_{index * 360 // VIEW_COUNT:03d}.png", image)
     clip = articulation_clip(robot)
-    with replacing(own / "clip.mkv") as temporary:
+    with replacing(own / "clip.mkv", within=own) as temporary:
         write_video(temporary, clip)
     save(own / "clip.png", np.hstack([*clip]))
     save(own / "ray_map.png", np.hstack([*ray_map(robot, articulation_action(robot)[::4])]))
@@ -104,7 +104,7 @@ def write_references(robot: RobotSpec, folder: Path) -> Path:
 def save(path: Path, image: np.ndarray) -> None:
     """Write a PNG of [h w 3] uint8."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_bytes(path, encode_png(image))
+    write_bytes(path, encode_png(image), within=path.parent)
 
 
 def write_sheets(robots: Sequence[RobotSpec], folder: Path) -> list[Path]:

@@ -18,7 +18,7 @@ import tyro
 from xew.config import user_errors
 from xew.dataset import explain_missing, find_records
 from xew.episode import EpisodeError, Record
-from xew.files import hold_lock, replacing
+from xew.files import hold_lock, write_text
 from xew.protocol import seed_split
 from xew.sim_warp.manifest import Manifest, TaskSeeds
 
@@ -81,8 +81,8 @@ def main() -> None:
     if not manifest.tasks:
         raise explain_missing(args.data)
     try:
-        with hold_lock(args.out), replacing(args.out) as file:
-            file.write_text(to_json(manifest))
+        with hold_lock(args.out):
+            write_text(args.out, to_json(manifest), within=args.out.parent)
     except OSError as error:
         raise EpisodeError(f"cannot write {args.out}: {error.strerror}. Choose another file with --out.") from error
     for task, seeds in manifest.tasks.items():

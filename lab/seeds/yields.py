@@ -211,14 +211,14 @@ def try_and_print(args: Args) -> None:
 
 def find_kept(path: Path) -> str:
     """The end of a page that this command does not write: from the first heading after YIELDS on; '' where there is none."""
-    text = path.read_text() if path.exists() else ""
+    text = path.read_text(encoding="utf-8") if path.exists() else ""
     start = text.find("\n## ", text.find(f"\n{YIELDS}\n") + 1)
     return text[start:] if YIELDS in text and start >= 0 else ""
 
 
 def write_page(path: Path, text: str) -> None:
     try:
-        write_text(path, text)
+        write_text(path, text, within=path.parent)
     except OSError as error:
         raise EpisodeError(f"cannot write {path}: {error.strerror}. Choose another file with --page.") from error
 

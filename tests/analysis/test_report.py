@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from tests.analysis.conftest import FRAMES, SEEDS, TASKS, Study
 from tests.analysis.reports.browser import find_faults, needs_chromium
 from xew.analysis.report import Args, Picture, _strip_section, _write_explorer, main, run_table
-from xew.analysis.reports import charts, pictures
+from xew.analysis.reports import charts
 from xew.analysis.reports.run_tables import Interval, RobotTable, Row
 from xew.analysis.reports.study_charts import run_chart
 from xew.analysis.scores import MetricInfo, read_scores
@@ -177,16 +177,6 @@ def test_the_explorer_plays_the_scenes_of_the_strips(study: Study, report: Path,
     assert "explorer" not in _strip_section([strip], replace(args, explorer=False))
     with pytest.raises(ConfigError, match="name them by --data and --rollouts"):
         _write_explorer(read_scores(study.scores), replace(args, rollouts=()))
-
-
-@pytest.mark.parametrize("frame_zero", ["given", "absent"])
-def test_a_rollout_is_shown_as_it_was_graded(frame_zero: str) -> None:
-    """At the episode's size, frame by frame, and no longer than the episode."""
-    truth = np.full((FRAMES, 24, 32, 3), 40, np.uint8) + np.arange(FRAMES, dtype=np.uint8)[:, None, None, None] * 10
-    for size in ((24, 32), (12, 16), (48, 64)):
-        first = 0 if frame_zero == "given" else 1
-        video = np.stack([cv2.resize(frame, size[::-1]) for frame in (*truth[first:], truth[0])])
-        assert np.array_equal(pictures.fit_to_episode(video, truth, frame_zero), truth)
 
 
 def test_a_report_shows_rollouts_of_another_size_that_begin_with_frame_1(study: Study, tmp_path: Path) -> None:

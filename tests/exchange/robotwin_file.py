@@ -76,7 +76,11 @@ def intrinsics() -> np.ndarray:
 
 
 def write_legacy(path: Path, size: tuple[int, int] = (WIDTH, HEIGHT)) -> Path:
+    """An episode of the older layout, with its file of instructions in the folder next to it."""
     path.parent.mkdir(parents=True, exist_ok=True)
+    instructions = path.parents[1] / "instructions" / f"{path.stem}.json"
+    instructions.parent.mkdir(exist_ok=True)
+    instructions.write_text('{"seen": ["put the block on the mat"], "unseen": []}')
     scale = np.diag([size[0] / WIDTH, size[0] / WIDTH, 1])
     with h5py.File(path, "w") as file:
         for arm, side in enumerate(("left", "right")):

@@ -1,6 +1,8 @@
 """Episodes as a LeRobotDataset v3.0: read back with pyarrow and PyAV, and with LeRobot itself where it is installed."""
 
 import json
+from dataclasses import replace
+from fractions import Fraction
 from pathlib import Path
 
 import av
@@ -85,16 +87,22 @@ def test_an_episode_has_files_of_its_own(exported: Path) -> None:
         files = list((exported / key).rglob("*.mp4"))
         assert len(set(places)) == len(files) == len(table)
         with av.open(str(files[0])) as container:
-            assert container.streams.video[0].average_rate == lerobot.RATE
+            assert container.streams.video[0].average_rate == Fraction(50, 3)
 
 
 def test_a_red_block_stays_red(tmp_path: Path) -> None:
     video = np.full((4, HEIGHT, WIDTH, 3), 255, np.uint8)
     video[:, 80:160, 100:200] = (200, 30, 20)
-    film = lerobot._VideoFiles(tmp_path / "observation.images.head")
+    film = lerobot._VideoFiles(tmp_path / "observation.images.head", Fraction(50, 3))
     film.add(video)
     frames, _ = decoded(tmp_path / "observation.images.head/chunk-000/file-000.mp4")
     assert np.abs(frames[:, 90:150, 110:190].reshape(-1, 3).astype(int) - (200, 30, 20)).max() <= 8
+
+
+def test_frames_of_another_size_are_refused(tmp_path: Path) -> None:
+    film = lerobot._VideoFiles(tmp_path / "observation.images.head", Fraction(25))
+    with pytest.raises(EpisodeError, match="frames of 640x480, expected 320x240"):
+        film.add(np.zeros((2, 480, 640, 3), np.uint8))
 
 
 def test_the_header_is_that_of_the_format(data: Path, exported: Path) -> None:
@@ -139,6 +147,38 @@ def test_files_are_closed_as_they_fill(data: Path, tmp_path: Path, monkeypatch: 
         key = "videos/observation.images.head"
         film = tmp_path / f"many/{key}/chunk-00{row[f'{key}/chunk_index']}/file-00{row[f'{key}/file_index']}.mp4"
         assert len(decoded(film)[0]) == row["length"] and row[f"{key}/from_timestamp"] == 0
+
+
+def with_rate(data: Path, out: Path, rates: dict[int, float]) -> Path:
+    """A copy of the Piper's episodes of these seeds with other frame rates."""
+    for folder, record in find_accepted(data):
+        if record.robot == "piper" and record.seed in rates:
+            changed = replace(record, frame_rate=rates[record.seed])
+            write_episode(out, changed, read_states(folder), read_video(folder / "rgb.mkv"))
+    return out
+
+
+@pytest.mark.parametrize(("rate", "fps"), [(25.0, 25), (250 / 7, 250 / 7), (30000 / 1001, 30000 / 1001), (1000 / 60, 50 / 3)])
+def test_the_episodes_rate_is_the_set_s(rate: float, fps: float, data: Path, tmp_path: Path) -> None:
+    export(Args(with_rate(data, tmp_path / "data", {0: rate, 1: rate}), tmp_path / "out"))
+    information = json.loads((tmp_path / "out/meta/info.json").read_text())
+    assert information["fps"] == pytest.approx(fps, rel=1e-5) and isinstance(information["fps"], type(fps))
+    assert information["features"]["observation.images.head"]["info"]["video.fps"] == information["fps"]
+    rows = pd.read_parquet(tmp_path / "out/data/chunk-000/file-000.parquet")
+    assert rows["timestamp"][:3].tolist() == pytest.approx([0, 1 / fps, 2 / fps], rel=1e-5)
+    _, times = decoded(next((tmp_path / "out").rglob("*.mp4")))
+    assert times[1] == pytest.approx(1 / fps, rel=1e-3)
+    row = parquet.read_table(tmp_path / "out/meta/episodes").to_pylist()[0]
+    assert row["videos/observation.images.head/to_timestamp"] == pytest.approx(row["length"] / fps, rel=1e-5)
+
+
+def test_mixed_rates_are_refused(data: Path, tmp_path: Path) -> None:
+    mixed = with_rate(data, tmp_path / "data", {0: 25.0, 1: 50 / 3})
+    with pytest.raises(
+        EpisodeError, match=r"has episodes at 16.67 \(2\) and at 25.00 \(2\) frames per second, which cannot be"
+    ):
+        export(Args(mixed, tmp_path / "out"))
+    assert not (tmp_path / "out").exists()
 
 
 def test_what_an_import_does_not_know_is_left_out(data: Path, tmp_path: Path) -> None:

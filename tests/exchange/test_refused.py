@@ -69,7 +69,7 @@ def test_what_is_refused(line: dict[str, str], whole: Path, tmp_path: Path) -> N
             read_robotwin(path)
     else:
         with pytest.raises((EpisodeError, ConfigError)) as error:
-            robotwin.import_episode(path, robotwin.Args(path, tmp_path / "out"))
+            robotwin.import_episode(path, robotwin.Args(path, tmp_path / "out", instruction=""))
         assert not list(tmp_path.rglob("episode.json"))
     said = str(error.value)
     assert str(path) in said and line["says"] in said and "\n" not in said and len(said) < 600, said

@@ -1,9 +1,13 @@
 """RoboTwin's HDF5 files become episodes: colors, quaternions, commands, what stays unknown, and what is told of bad files."""
 
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+import cv2
 import h5py
 import numpy as np
 import pytest
@@ -23,7 +27,8 @@ from xew.episode import (
     write_episode,
 )
 from xew.exchange import robotwin
-from xew.exchange.hdf5 import decode_picture, read_robotwin, tool_center
+from xew.exchange.hdf5 import ReadOptions, read_robotwin, tool_center
+from xew.exchange.pictures import Colors, decode_picture
 from xew.exchange.robotwin import Args, find_episodes, fit_bases, import_all, main
 from xew.protocol import LEFT_ARM, LEFT_GRIPPER, RIGHT_ARM, RIGHT_GRIPPER
 from xew.sim_warp.geometry.camera import HEAD_CAMERA
@@ -40,9 +45,6 @@ def imported(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFa
     root = tmp_path_factory.mktemp("imported")
     if request.param == "legacy":
         made.write_legacy(root / LEGACY)
-        (root / LEGACY.parents[1] / "instructions").mkdir()
-        instructions = '{"seen": ["put the block on the mat"], "unseen": []}'
-        (root / LEGACY.parents[1] / "instructions" / "episode3.json").write_text(instructions)
         (root / LEGACY.parents[1] / "seed.txt").write_text("0 1 5 17 ")
     else:
         made.write_modern(root / MODERN)
@@ -127,6 +129,25 @@ def test_two_configurations_of_a_task_are_not_taken_for_one(tmp_path: Path) -> N
     assert not refused and records[0].task == "place_cup_randomized"
 
 
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"frame_rate": 25.0}, "with another frame rate; delete it"),
+        ({"instruction": ""}, "with another instruction; delete it"),
+        ({"colors": "other"}, "with another picture; delete it"),
+        ({"frame_rate": 25.0, "colors": "other"}, "with another frame rate and picture; delete it"),
+    ],
+)
+def test_an_episode_that_was_read_otherwise_is_not_kept_in_silence(
+    options: dict[str, Any], said: str, imported: Path, tmp_path: Path
+) -> None:
+    root, legacy = imported.parents[3], read_record(imported).source.endswith("(legacy)")
+    if "colors" in options:
+        options = options | {"colors": "ordinary" if legacy else "swapped"}
+    _, refused = import_all(find_episodes(root), Args(root, root / "out", **options))
+    assert len(refused) == 1 and f"{imported} holds this recording {said}" in refused[0]
+
+
 def test_a_seed_that_was_simulated_is_another_scene(tmp_path: Path) -> None:
     path = made.write_legacy(tmp_path / LEGACY)
     write_episode(tmp_path / "out", Record("place_cup", 3, "piper", False, "plan"))
@@ -140,19 +161,20 @@ def test_a_seed_that_was_simulated_is_another_scene(tmp_path: Path) -> None:
 def test_files_may_be_named_from_their_own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made.write_legacy(tmp_path / LEGACY)
     beside = tmp_path / LEGACY.parents[1]
-    (beside / "instructions").mkdir()
-    (beside / "instructions" / "episode3.json").write_text('["put the block on the mat"]')
+    (beside / "instructions" / "episode3.json").write_text('["put the cup on the mat"]')
     (beside / "seed.txt").write_text("0 1 5 17")
     monkeypatch.chdir(tmp_path / LEGACY.parent)
     records, refused = import_all(find_episodes(Path()), Args(Path(), tmp_path / "out"))
     assert not refused and (records[0].task, records[0].seed) == ("place_cup", 17)
-    assert records[0].instruction == "put the block on the mat"
+    assert records[0].instruction == "put the cup on the mat"
 
 
 def test_another_robot_is_not_taken_for_it(tmp_path: Path) -> None:
     recorded = read_robotwin(made.write_legacy(tmp_path / LEGACY))
     assert fit_bases(ROBOTS["arx_x5"], recorded) is not None
     assert fit_bases(ROBOTS["piper"], recorded) is None and fit_bases(ROBOTS["franka_panda"], recorded) is None
+    records, refused = import_all([tmp_path / LEGACY], Args(tmp_path, tmp_path / "out", robot="franka_panda"))
+    assert not records and "has arms of 6 joints, Franka (Panda) has 7; pass another --robot" in refused[0]
     records, refused = import_all([tmp_path / LEGACY], Args(tmp_path, tmp_path / "out", robot="piper"))
     assert not refused and set(records[0].hashes) == {"states", "rgb"} and records[0].keypoint_names == ()
 
@@ -163,7 +185,7 @@ def test_a_robot_that_moved_is_told(tmp_path: Path) -> None:
     shutil.copy(tmp_path / LEGACY, moved)
     with h5py.File(moved, "r+") as file:
         file["endpose/left_endpose"][:, 0] += 0.05
-    records, refused = import_all([tmp_path / LEGACY, moved], Args(tmp_path, tmp_path / "out"))
+    records, refused = import_all([tmp_path / LEGACY, moved], Args(tmp_path, tmp_path / "out", instruction=""))
     assert len(records) == 1 and len(refused) == 1
     assert "the base of ARX-X5 is 50 mm from its place" in refused[0] and "another --out" in refused[0]
 
@@ -200,16 +222,209 @@ def test_frames_are_as_far_apart_as_the_file_says(steps: int, milliseconds: int,
     assert 1000 / records[0].frame_rate == pytest.approx(milliseconds)
 
 
+@pytest.mark.parametrize(
+    ("frequency", "texts", "rate"),
+    [
+        (10, {"instructions": '["a"]'}, 25),  # RoboTwin counts steps of 4 ms
+        (25, {"instruction": "a"}, 25),  # RoboDojo has frames per second
+        (30, {"instruction": "a"}, 30),
+        (None, {"instructions": '["a"]'}, 50 / 3),
+        (25, {}, "--frame-rate 10 or --frame-rate 25"),
+        (None, {"instruction": "a"}, "no additional_info/frequency, and the file is not RoboTwin's; expected --frame-rate HZ"),
+        (0, {"instruction": "a"}, "expected one number from 1 to 250"),
+    ],
+)
+def test_the_meaning_of_frequency_is_detected_or_asked_for(
+    frequency: int | None, texts: dict[str, str], rate: float | str, tmp_path: Path
+) -> None:
+    path = made.write_modern(tmp_path / MODERN)
+    with h5py.File(path, "a") as file:
+        del file["instructions"], file["additional_info/frequency"]
+        for name, value in (texts | ({} if frequency is None else {"additional_info/frequency": frequency})).items():
+            file[name] = value
+    if isinstance(rate, str):
+        with pytest.raises(EpisodeError, match=rate):
+            read_robotwin(path, ReadOptions(instruction=""))
+    else:
+        assert read_robotwin(path).frame_rate == pytest.approx(rate)
+    assert read_robotwin(path, ReadOptions(frame_rate=20, instruction="")).frame_rate == 20
+
+
+TEXT = "put the block on the mat"
+
+
+@pytest.mark.parametrize(
+    ("stored", "beside", "expected"),
+    [
+        ({"instructions": np.array([TEXT, "b"], h5py.string_dtype())}, None, TEXT),
+        ({"instructions": f'["", "{TEXT}"]'}, None, TEXT),
+        ({"instruction": TEXT}, None, TEXT),
+        ({"instructions": "[]", "instruction": TEXT}, None, TEXT),
+        ({}, '{"seen": [], "unseen": ["put the block on the mat"]}', TEXT),
+        ({}, '{"instruction": "put the block on the mat"}', TEXT),
+        ({}, f'"{TEXT}"', TEXT),
+        ({}, TEXT, TEXT),
+        ({}, None, "expected a text in one of them, or --instruction TEXT"),
+        ({}, '{"texts": ["a"]}', "expected a text in one of them, or --instruction TEXT"),
+        ({"instructions": "[1, 2]", "instruction": " "}, None, "expected a text in one of them, or --instruction TEXT"),
+        ({"instructions": 3.0}, None, "instructions is float64 .*; expected texts"),
+        ({"instruction": np.bytes_(b"\xe9")}, None, "not UTF-8"),
+    ],
+)
+def test_an_instruction_is_found_or_asked_for(
+    stored: dict[str, object], beside: str | None, expected: str, tmp_path: Path
+) -> None:
+    path = made.write_modern(tmp_path / MODERN)
+    with h5py.File(path, "a") as file:
+        del file["instructions"]
+        for name, value in stored.items():
+            file[name] = value
+    if beside is not None:
+        (path.parents[1] / "instructions").mkdir()
+        (path.parents[1] / "instructions" / f"{path.stem}.json").write_text(beside)
+    if expected == TEXT:
+        assert read_robotwin(path, ReadOptions(frame_rate=25)).instruction == TEXT
+    else:
+        with pytest.raises(EpisodeError, match=expected):
+            read_robotwin(path, ReadOptions(frame_rate=25))
+    assert read_robotwin(path, ReadOptions(frame_rate=25, instruction="")).instruction == ""
+
+
+@pytest.mark.parametrize(
+    ("folder", "robot"),
+    [
+        ("aloha-agilex_clean_50", "aloha_agilex"),
+        ("aloha_agilex", "aloha_agilex"),
+        ("ARX-X5_randomized_500", "arx_x5"),
+        ("arx_x5", "arx_x5"),
+        ("UR5-WSG_demo_clean", "ur5_wsg"),
+        ("franka-panda", "franka_panda"),
+        ("piper_clean", "piper"),
+    ],
+)
+def test_the_folder_above_data_names_the_robot(folder: str, robot: str) -> None:
+    assert robotwin._embodiment(Path("/sandpiper/place_cup") / folder / "data" / "episode3.hdf5") == robot
+
+
+@pytest.mark.parametrize(
+    ("name", "seeds", "expected"),
+    [
+        ("episode3.hdf5", None, 3),
+        ("episode_0000003.hdf5", None, 3),
+        ("episode3.hdf5", "7 8 9 10", 10),
+        ("episode3_v2.hdf5", None, "the file's name gives no seed; rename it to episodeN.hdf5"),
+        ("episode_3_arx_x5.hdf5", None, "the file's name gives no seed"),
+        ("episode.hdf5", None, "the file's name gives no seed"),
+        ("episode-3.hdf5", None, "the file's name gives no seed"),
+        ("episode3.hdf5", "7 8", r"seed.txt has 2 entries and no seed of episode3.hdf5; correct it"),
+        ("episode3.hdf5", "7 8 9 -1", "seed.txt has 4 entries and no seed of episode3.hdf5; correct it"),
+    ],
+)
+def test_the_seed_is_the_number_of_the_name(name: str, seeds: str | None, expected: int | str, tmp_path: Path) -> None:
+    (tmp_path / "data").mkdir()
+    if seeds is not None:
+        (tmp_path / "seed.txt").write_text(seeds)
+    if isinstance(expected, int):
+        assert robotwin._seed(tmp_path / "data" / name) == expected
+    else:
+        with pytest.raises(EpisodeError, match=expected):
+            robotwin._seed(tmp_path / "data" / name)
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ({"observations/qpos": np.zeros((5, 14)), "action": np.zeros((5, 14))}, "holds an episode of ALOHA or ACT"),
+        ({"data/demo_0/actions": np.zeros((5, 7))}, "holds demonstrations of robomimic or LIBERO"),
+        ({"anything": 1}, "has no joint_action/left_arm .at its top: anything"),
+    ],
+)
+def test_files_of_other_projects_are_refused_by_name(content: dict[str, object], said: str, tmp_path: Path) -> None:
+    path = tmp_path / "demo.hdf5"
+    with h5py.File(path, "w") as file:
+        for name, value in content.items():
+            file[name] = value
+    with pytest.raises(EpisodeError, match=said) as error:
+        read_robotwin(path)
+    assert ("docs/exchange.md" in str(error.value)) == ("holds" in said)
+    with pytest.raises(EpisodeError, match=r"no episode\*.hdf5 at .*; there are demo.hdf5; pass"):
+        find_episodes(tmp_path)
+
+
+def test_a_file_that_its_writer_holds_open_is_named(tmp_path: Path) -> None:
+    path = made.write_modern(tmp_path / MODERN)
+    code = f"import h5py; file = h5py.File({str(path)!r}, 'r+'); print('open', flush=True); input()"
+    with subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as writer:
+        assert writer.stdout is not None and writer.stdout.readline()
+        with pytest.raises(EpisodeError, match="is open in another program"):
+            read_robotwin(path)
+        writer.communicate(b"\n")
+
+
 def test_large_pictures_are_halved_with_their_camera(tmp_path: Path) -> None:
     recorded = read_robotwin(made.write_legacy(tmp_path / LEGACY, (2 * WIDTH, 2 * HEIGHT)))
     assert recorded.rgb.shape[1:] == (HEIGHT, WIDTH, 3) and np.allclose(recorded.intrinsics, HEAD_CAMERA.intrinsics)
 
 
-def test_pictures_of_both_kinds() -> None:
-    for marked in (False, True):
-        image = decode_picture(made.encoded(made.picture(), marked))
-        assert image is not None and np.abs(image[HEIGHT // 3, WIDTH // 3].astype(int) - made.RED).max() <= 4
-    assert decode_picture(b"no picture") is None
+def segment(marker: int, content: bytes) -> bytes:
+    """A segment of a JPEG file."""
+    return bytes([0xFF, marker]) + (len(content) + 2).to_bytes(2, "big") + content
+
+
+COMMENT, APP1 = 0xFE, 0xE1
+ORDINARY = made.encoded(made.picture()[..., ::-1])
+SWAPPED = made.encoded(made.picture())
+
+
+@pytest.mark.parametrize(
+    ("encoded", "colors"),
+    [
+        (SWAPPED, "marked"),
+        (ORDINARY[:2] + segment(COMMENT, b"XPL-RGB1") + ORDINARY[2:], "marked"),
+        (ORDINARY[:2] + segment(APP1, bytes(5000)) + segment(COMMENT, b"XPL-RGB1") + ORDINARY[2:], "marked"),
+        (SWAPPED[:2] + segment(COMMENT, b"no XPL-RGB1") + SWAPPED[2:], "marked"),
+        (SWAPPED[:2] + segment(APP1, b"XPL-RGB1") + SWAPPED[2:], "marked"),
+        (ORDINARY, "ordinary"),
+        (cv2.imencode(".png", made.picture()[..., ::-1])[1].tobytes(), "ordinary"),
+        (cv2.imencode(".png", made.picture())[1].tobytes(), "swapped"),
+    ],
+)
+def test_a_red_block_is_red_as_its_comment_or_the_option_says(encoded: bytes, colors: Colors) -> None:
+    block = decode_picture(encoded, colors)[HEIGHT // 3, WIDTH // 3]
+    assert np.abs(block.astype(int) - made.RED).max() <= 4
+
+
+@pytest.mark.parametrize(
+    ("encoded", "said"),
+    [
+        (b"no picture", "begins with b'no pictu'; expected a JPEG"),
+        (b"", "begins with b''; expected a JPEG"),
+        (SWAPPED[: len(SWAPPED) // 2], "cannot be decoded: image file is truncated"),
+        (cv2.imencode(".png", made.picture())[1].tobytes(), "is a PNG, which has no place for RoboTwin's mark; pass --colors"),
+        (cv2.imencode(".jpg", np.zeros((4096, 4096, 3), np.uint8))[1].tobytes(), "has 4096x4096 pixels"),
+    ],
+)
+def test_a_picture_that_cannot_be_read_is_refused(encoded: bytes, said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        decode_picture(encoded)
+
+
+@pytest.mark.parametrize("name", ["observation/head_camera/rgb", "vision/cam_head/colors"])
+@pytest.mark.parametrize("size", [(WIDTH, HEIGHT), (2 * WIDTH, 2 * HEIGHT)])
+def test_raw_pictures_are_rgb(name: str, size: tuple[int, int], tmp_path: Path) -> None:
+    legacy = name.startswith("observation")
+    path = made.write_legacy(tmp_path / LEGACY) if legacy else made.write_modern(tmp_path / MODERN)
+    rewrite(name, np.repeat(made.picture(size)[None], made.FRAMES, 0))(path)
+    rgb = read_robotwin(path).rgb
+    assert rgb.shape == (made.FRAMES, HEIGHT, WIDTH, 3) and (rgb[:, HEIGHT // 3, WIDTH // 3] == made.RED).all()
+
+
+def test_the_camera_of_robotwin_s_converter_is_found(tmp_path: Path) -> None:
+    """It writes `extrinsic_matrix`; observations have `extrinsics_matrix`."""
+    path = made.write_modern(tmp_path / MODERN)
+    with h5py.File(path, "a") as file:
+        file.move("vision/cam_head/extrinsics_matrix", "vision/cam_head/extrinsic_matrix")
+    assert np.allclose(read_robotwin(path).extrinsics, HEAD_CAMERA.extrinsics)
 
 
 def test_tool_center_of_a_hand_that_points_down() -> None:
@@ -250,10 +465,13 @@ HEAD = "observation/head_camera"
         (rewrite("joint_action/left_arm", np.zeros((made.FRAMES, 5))), "the arms have 5 and 6 joints; expected six or seven"),
         (rewrite("joint_action/left_arm", np.zeros(made.FRAMES)), r"left_arm is float64 of shape \(5,\); expected numbers"),
         (rewrite("joint_action/left_arm", np.full((made.FRAMES, 6), np.nan)), "left_arm holds numbers that are not finite"),
+        (rewrite("joint_action/left_arm", np.full((made.FRAMES, 6), 90.0)), "the arms' joints reach 90; expected radians"),
+        (rewrite("joint_action/left_gripper", np.linspace(0, 90, made.FRAMES)), "the grippers go from 0 to 90; expected 0 "),
+        (rewrite("joint_action/left_gripper", np.linspace(-1, 1, made.FRAMES)), "the grippers go from -1 to 1; expected 0 "),
         (rewrite("joint_action/left_gripper", np.zeros(3)), "have 5, 5, 3, 5, 5, 5 frames; expected as many of each"),
         (rewrite("endpose/left_endpose", np.zeros((made.FRAMES, 7))), "quaternions that are not of length 1"),
         (rewrite("endpose/left_endpose", np.zeros((made.FRAMES, 6))), "the end poses have another shape"),
-        (rewrite(f"{HEAD}/rgb", np.array([b"jpeg"] * made.FRAMES)), "frame 0, cannot be decoded; expected a JPEG"),
+        (rewrite(f"{HEAD}/rgb", np.array([b"jpeg"] * made.FRAMES)), "at frame 0 begins with b'jpeg'; expected a JPEG"),
         (rewrite(f"{HEAD}/rgb", np.array([b"jpeg"])), "has 1 pictures; expected one for each of 5 frames"),
         (rewrite(f"{HEAD}/intrinsic_cv", np.eye(4)), "intrinsic_cv has shape"),
         (rewrite(f"{HEAD}/extrinsic_cv", np.eye(4)), "extrinsic_cv does not see the table"),
@@ -269,11 +487,68 @@ def test_a_bad_file_ends_in_one_line(damage: Callable[[Path], None], told: str, 
     assert "\n" not in str(error.value) and str(path) in str(error.value)
 
 
+def declare(name: str, shape: tuple[int, ...], kind: object, **options: object) -> Callable[[Path], None]:
+    """Replace a data set by one of which nothing is stored."""
+
+    def change(path: Path) -> None:
+        with h5py.File(path, "r+") as file:
+            del file[name]
+            file.create_dataset(name, shape, kind, **options)
+
+    return change
+
+
+def promise_pictures(path: Path) -> None:
+    """One stored picture, of which every frame is a copy without a cost."""
+    frames = 5000
+    for name in ("joint_action/left_arm", "joint_action/right_arm"):
+        rewrite(name, np.zeros((frames, 6), np.float32))(path)
+    for name in ("joint_action/left_gripper", "joint_action/right_gripper"):
+        rewrite(name, np.zeros(frames, np.float32))(path)
+    rewrite("endpose", None)(path)
+    with h5py.File(path, "r+") as file:
+        del file[f"{HEAD}/rgb"]
+        file.create_dataset(f"{HEAD}/rgb", data=np.array([SWAPPED] * frames), compression="gzip")
+
+
+def share_a_picture(path: Path) -> None:
+    """Large pictures of one color, compressed once more."""
+    large = cv2.imencode(".jpg", np.zeros((3072, 4096, 3), np.uint8))[1].tobytes()
+    with h5py.File(path, "r+") as file:
+        del file[f"{HEAD}/rgb"]
+        file.create_dataset(f"{HEAD}/rgb", data=np.array([large] * made.FRAMES), compression="gzip")
+        file["padding"] = np.zeros(200_000, np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("damage", "told"),
+    [
+        (declare("joint_action/left_arm", (10**9, 6), "f8", chunks=(1024, 6)), "left_arm declares 48,000,000,000 bytes, of a"),
+        (
+            declare("joint_action/left_arm", (5, 6), "f8", chunks=(10**8, 6), maxshape=(None, 6)),
+            "left_arm declares 4,800,000,000",
+        ),
+        (declare(f"{HEAD}/rgb", (5, 16384, 8192, 3), "u1", chunks=(1, 64, 64, 3)), "rgb declares 2,013,265,920 bytes, of a"),
+        (
+            declare(f"{HEAD}/rgb", (5,), "S1000000", chunks=(1,)),
+            "rgb promises pictures of 1,000,000 bytes; expected at most the",
+        ),
+        (declare(f"{HEAD}/intrinsic_cv", (10**8, 3, 3), "f8", chunks=(1024, 3, 3)), "intrinsic_cv declares 7,200,000,000"),
+        (promise_pictures, "rgb promises 5,000 pictures; expected pictures of"),
+        (share_a_picture, "rgb decodes to more than the"),
+    ],
+)
+def test_sizes_are_checked_before_anything_is_read(damage: Callable[[Path], None], told: str, tmp_path: Path) -> None:
+    path = made.write_legacy(tmp_path / LEGACY)
+    damage(path)
+    with pytest.raises(EpisodeError, match=told):
+        read_robotwin(path)
+
+
 @pytest.mark.parametrize("name", ["seed.txt", "instructions/episode3.json"])
 def test_a_bad_file_beside_it_is_named(name: str, tmp_path: Path) -> None:
     beside = tmp_path / LEGACY.parents[1] / name
     path = made.write_legacy(tmp_path / LEGACY)
-    beside.parent.mkdir(exist_ok=True)
     beside.write_bytes(b"\xff\xfe\x00")
     records, refused = import_all([path], Args(tmp_path, tmp_path / "out"))
     assert not records and len(refused) == 1 and refused[0].startswith(f"{beside} cannot be read as text")
@@ -291,17 +566,18 @@ def test_the_command_imports_what_it_can_and_names_the_rest(
         main()
     told = capsys.readouterr()
     assert left.value.code == 2 and "1 episodes under" in told.out
-    assert f"error: {broken} cannot be read as HDF5" in told.err and "2 files were not imported." in told.err
-    assert f"{unnamed}: no folder above it is named after a robot" in told.err
+    assert f"error: 2 of 3 files were not imported:\n{broken} cannot be read as HDF5" in told.err
+    assert f"{unnamed} is not at <task>/<robot>/data/episodeN.hdf5" in told.err
     assert len(find_accepted(tmp_path / "out")) == 1
 
 
 @pytest.mark.parametrize(
     ("flags", "told"),
     [
-        ((), "no folder above it is named after a robot"),
+        ((), "RoboTwin's layout; pass --robot"),
         (("--robot", "pipper"), "did you mean 'piper'"),
-        (("--robot", "piper"), "does not follow RoboTwin's layout"),
+        (("--robot", "piper"), "RoboTwin's layout; pass --task"),
+        (("--frame-rate", "0"), "the frame rate is 0, expected 1 to 1000"),
     ],
 )
 def test_mistakes_are_told_in_a_line(

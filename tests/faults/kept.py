@@ -16,7 +16,7 @@ from xew.analysis.studies.ledger import Ledger
 from xew.analysis.studies.plan import Step
 from xew.episode import Record, read_record
 from xew.metrics.grading.bundle import differences, read_bundle, write_bundle
-from xew.metrics.grading.scores import Cell, CellStore
+from xew.metrics.grading.scores import Cell, CellStore, _curve_table, _row_table
 from xew.model.cache.scales import read_scales
 from xew.model.codecs.autoencoders import ConvAutoencoderCodec, WanVaeCodec
 from xew.model.codecs.codec import load_kept_codec
@@ -25,7 +25,7 @@ from xew.model.codecs.vae import VAES
 from xew.model.conditions import ACTIONS, list_conditions
 from xew.model.rollout import is_done
 from xew.model.runs.checkpoint import find_damage
-from xew.model.runs.folder import START, trace_start
+from xew.model.runs.folder import EPISODES, START, check_episodes, trace_start
 from xew.rollout import read_rollout, read_rollout_video
 from xew.sim_warp.manifest import read_manifest
 
@@ -36,7 +36,8 @@ STEP = Step("train", "x", (), (), {}, Path("runs/x"))
 
 
 def header(folder: Path) -> tuple[Path, Any, Callable[[], Any]]:
-    return folder / "episode.json", asdict(HEADER), lambda: read_record(folder)
+    place = folder / "place_empty_cup/0000000/piper"
+    return place / "episode.json", asdict(HEADER), lambda: read_record(place)
 
 
 def rollout(folder: Path) -> tuple[Path, Any, Callable[[], Any]]:
@@ -86,6 +87,11 @@ def start(folder: Path) -> tuple[Path, Any, Callable[[], Any]]:
     return folder / START, {"run": "runs/x", "step": 4, "saved": None}, lambda: trace_start(folder, folder / "no-run")
 
 
+def episodes(folder: Path) -> tuple[Path, Any, Callable[[], Any]]:
+    digests = {"place_empty_cup/0/piper": "0" * 16, "place_empty_cup/1/piper": "1" * 16}
+    return folder / EPISODES, digests, lambda: check_episodes(folder, [(folder, HEADER)])
+
+
 def scales(folder: Path) -> tuple[Path, Any, Callable[[], Any]]:
     conditions = [c for entry in ACTIONS.values() if entry for c in list_conditions(entry) if c.scale != "none"][:1]
     content = {conditions[0].name: {"middle": [0.0, 1.0], "width": [1.0, 2.0], "limit": 1.0}}
@@ -130,7 +136,13 @@ def scores(folder: Path) -> tuple[Path, Any, Callable[[], Any]]:
 def cell(folder: Path) -> tuple[Path, Any, Callable[[], Any]]:
     store = CellStore(folder / "cells", folder / "baselines")
     content = {"content": CELL.content, "exact_frames": 0, "values": {"psnr": 20.0}, "curves": {"psnr": [1.0, None]}}
-    return store._path(CELL), content, lambda: store.missing(CELL, ["psnr"])
+
+    def read() -> None:
+        if not store.missing(CELL, ["psnr"]) and (grades := store.read(CELL)):
+            _row_table(CELL, grades, ["psnr"])
+            _curve_table(CELL, grades, ["psnr"])
+
+    return store._path(CELL), content, read
 
 
 def vae(folder: Path) -> tuple[Path, Any, Callable[[], Any]]:
@@ -158,6 +170,6 @@ def config(folder: Path) -> tuple[Path, Any, Callable[[], Any]]:
 
 KINDS = {
     kind.__name__: kind
-    for kind in (header, rollout, seeds, bundle, start, scales, ledger, scores, cell, vae, autoencoder, sums, config)
+    for kind in (header, rollout, seeds, bundle, start, episodes, scales, ledger, scores, cell, vae, autoencoder, sums, config)
 }
 """Functions of a folder to the path of a kind of file, its whole content, and a function that reads it."""

@@ -30,13 +30,13 @@ clip: {frames: 5, height: 32, width: 48}
 codec: {weights: TINY_CODEC}
 model: {size: tiny, action: joints, embodiment: robot_render,
   history: [], reference: frame, visibility: joint, prediction: velocity, dtype: float32, remat: none}
-train: {steps: 2, batch: 1, log_every: 1, save_every: 1, sample_every: 0, keep_checkpoints: 2,
+train: {steps: 2, batch: 1, log_every: 1, save_every: 1, samples: 0, keep_checkpoints: 2,
   optimizer: adamw, warmup_steps: 0, decay_to: 1, ema: 0, motion_loss_weight: 0}
 rollout: {steps: 1, batch: 2,
   sampler: euler}
 """.replace("TINY_CODEC", str(TINY_CODEC))
 ROLLED_OUT = ("piper", SEEN_ROBOTS[0])
-TIMES = "time/"
+TIMES = "workload/"
 """Beginning of the names of logged numbers that differ between two runs of the same training."""
 
 

@@ -31,7 +31,7 @@ MODULES = (
     "xew.analysis.report",
 )
 """Modules that the server imports before it forks."""
-LEFT_OVER = re.compile(r"\.writing-.*|\..+\.\d+|\..*\.lock|.*orbax-checkpoint-tmp.*")
+LEFT_OVER = re.compile(r"\.writing-.*|\..+\.\d+(-[0-9a-f]+)?|\..*\.lock|.*orbax-checkpoint-tmp.*")
 """Names of what only a killed process leaves; locks go with who held them."""
 
 

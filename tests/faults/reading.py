@@ -46,6 +46,8 @@ READERS: dict[str, tuple[str, Callable[[Path], Any]]] = {
     "robot": ("robot.yaml", load_robot),
     "urdf": ("arm.urdf", load_urdf),
     "mesh": ("arm.stl", _read_mesh),
+    "collada": ("arm.dae", _read_mesh),
+    "gltf": ("arm.glb", _read_mesh),
 }
 """Name of a reader to the name of its file and the function that is called with its path."""
 

@@ -76,8 +76,8 @@ def plan(data: Path, out: Path) -> None:
 
 
 WRITERS: dict[str, Callable[[Path, Path], Any]] = {
-    "a text": lambda data, out: write_text(out / "kept.txt", 100_000 * "new"),
-    "bytes": lambda data, out: write_bytes(out / "kept.txt", bytes(300_000)),
+    "a text": lambda data, out: write_text(out / "kept.txt", 100_000 * "new", within=out),
+    "bytes": lambda data, out: write_bytes(out / "kept.txt", bytes(300_000), within=out),
     "an episode": episode,
     "a rollout": rollout,
     "a run": begin,

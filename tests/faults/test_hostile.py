@@ -75,10 +75,16 @@ def evil(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 
 def change(folder: Path, **values: Any) -> Path:
-    """Change values of an episode's header."""
+    """Change values of an episode's header; returns its folder, which has the header's name where a folder can have it."""
     path = folder / "episode.json"
-    path.write_text(json.dumps(json.loads(path.read_text()) | values))
-    return folder
+    header = json.loads(path.read_text()) | values
+    path.write_text(json.dumps(header))
+    try:
+        place = episode_folder(folder.parents[2], header["task"], header["seed"], header["robot"])
+    except EpisodeError:
+        return folder
+    place.parent.mkdir(parents=True, exist_ok=True)
+    return folder.rename(place)
 
 
 # --- Names and paths.
@@ -100,7 +106,8 @@ def test_a_header_with_such_a_name_is_refused_by_its_reader(key: str, own: Path,
             read_record(own)
         assert "\n" not in str(error.value)
     for name in NAMES["accepted"]:
-        assert getattr(read_record(change(own, **{key: name})), key) == name
+        own = change(own, **{key: name})
+        assert getattr(read_record(own), key) == name
 
 
 def test_such_names_and_seeds_make_no_path(record_property: Any) -> None:
@@ -208,13 +215,15 @@ def write_scores(folder: Path, **names: str) -> Path:
 
 
 def test_the_importer_takes_no_path_from_folders_and_seeds(tmp_path: Path) -> None:
-    made = robotwin_file.write_legacy(tmp_path / "task/demo_arx-x5/data/episode0.hdf5")
-    path = made.parents[1] / "data/../../../task/../demo_arx-x5/data/episode0.hdf5"
-    (tmp_path / "demo_arx-x5").symlink_to(made.parents[1])
+    made = robotwin_file.write_legacy(tmp_path / "task/arx-x5/data/episode0.hdf5")
+    path = made.parents[1] / "data/../../../task/../arx-x5/data/episode0.hdf5"
+    (tmp_path / "arx-x5").symlink_to(made.parents[1])
     _, refused = robotwin.import_all([path], robotwin.Args(path, tmp_path / "out"))
     assert len(refused) == 1 and "'..'" in refused[0] and str(path) in refused[0]
     (made.parents[1] / "seed.txt").write_text("9" * 400)
-    assert robotwin._seed(made) == 0
+    with pytest.raises(EpisodeError, match=r"seed.txt has 1 entries and no seed of episode0.hdf5"):
+        robotwin._seed(made)
+    (made.parents[1] / "seed.txt").unlink()
     with pytest.raises(EpisodeError, match="expected a key"):
         robotwin.import_episode(made, robotwin.Args(made, tmp_path / "out", task="../../x"))
     assert not (tmp_path / "out").exists() or not list((tmp_path / "out").glob("**/episode.json"))
@@ -230,7 +239,7 @@ def test_no_module_that_data_name_is_imported(own: Path, evil: Path) -> None:
         lambda: render_perturbation(own, None),  # type: ignore[arg-type]
         lambda: recorded_robot(read_record(own).robot, own.parents[2]),
     ]
-    change(own, task="evil_data.evil:TASK", robot="evil_data.evil:SPEC")
+    own = change(own, task="evil_data.evil:TASK", robot="evil_data.evil:SPEC")
     for read in readers:
         with pytest.raises(UntrustedError, match=r"admit it: --trust evil_data\.evil"):
             read()
@@ -262,7 +271,7 @@ def test_no_module_that_a_run_names_is_imported(evil: Path, tmp_path: Path) -> N
 
 
 def test_what_the_user_admits_is_imported(own: Path, evil: Path) -> None:
-    change(own, task="evil_data.evil:TASK")
+    own = change(own, task="evil_data.evil:TASK")
     config.admit(["evil_data"])
     with pytest.raises(ConfigError, match="is a NoneType; expected a Task"):
         find_problem(own)
@@ -399,8 +408,11 @@ def test_overwrite_removes_a_run_and_nothing_else(tmp_path: Path) -> None:
     (run / "checkpoints/4/params/data").touch()
     (run / "notes.md").write_text("what I saw")
     (run / "codec").symlink_to(out)
+    with pytest.raises(OSError, match="is a link, and no link below"):
+        claim_run(run, experiment, load_experiment, resume=False, overwrite=True)
+    (run / "codec").unlink()
     claim_run(run, experiment, load_experiment, resume=False, overwrite=True)
-    assert sorted(path.name for path in run.iterdir() if not path.name.startswith(".")) == ["codec", "config.yaml", "notes.md"]
+    assert sorted(path.name for path in run.iterdir() if not path.name.startswith(".")) == ["config.yaml", "notes.md"]
     assert (run / "notes.md").read_text() == "what I saw" and (out / "thesis.tex").exists()
 
 

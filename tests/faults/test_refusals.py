@@ -54,14 +54,14 @@ def test_a_disk_that_fails_at_any_rename_is_told_in_one_line(
 ) -> None:
     """Also where no command expects it: whatever the system refuses, what was there before is still there."""
     path = tmp_path / "kept.txt"
-    write_text(path, "old")
+    write_text(path, "old", within=tmp_path)
 
     def refuse(*_: object) -> None:
         raise OSError(number, os.strerror(number))
 
     monkeypatch.setattr(os, "replace", refuse)
     with pytest.raises(SystemExit) as stop:
-        user_errors(write_text)(path, "new")
+        user_errors(write_text)(path, "new", within=tmp_path)
     said = capsys.readouterr().err
     assert stop.value.code == 2 and os.strerror(number) in said and said.count("\n") == 1
     assert path.read_text() == "old" and list(tmp_path.iterdir()) == [path]
@@ -110,7 +110,9 @@ def test_kills_at_every_rename_of_an_episode_and_a_run_lose_nothing(
                 # A folder is replaced by two renames: between them it is absent, and its cell is made again.
                 assert not folder.exists() or read_record(folder).instruction in (record.instruction, "new")
                 write_episode(tmp_path / "data", record, states)
-                assert read_record(folder) == replace(record, hashes={"states": record.hashes["states"]})
+                written = {name: getattr(record, name) for name in ("hashes", "files")}
+                kept = {name: {key: value for key, value in some.items() if "states" in key} for name, some in written.items()}
+                assert read_record(folder) == replace(record, **kept)
                 claim_run(run, experiment, load_experiment, resume=True, overwrite=False)
                 assert load_experiment(run / "config.yaml") == experiment
     record_property("tried kills at renames", kills)
@@ -185,5 +187,5 @@ def test_a_camera_without_a_focal_length_is_refused(value: float, tmp_path: Path
     states, record = read_states(folder), read_record(folder)
     states.intrinsics[0, 0] = value
     write_episode(tmp_path, record, states)
-    with pytest.raises(EpisodeError, match="its camera has"):
+    with pytest.raises(EpisodeError, match=r"its camera has|intrinsics has NaN"):
         read_states(folder)

@@ -65,6 +65,12 @@ def test_a_weight_file_that_asks_for_more_than_arrays_is_refused() -> None:
         read_arrays(io.BytesIO(pickle.dumps(np.random.default_rng)), ADMITTED)
 
 
+@pytest.mark.parametrize("content", [b"", b"h", b"(", b"unauthorized\n", b"\x80\x04\x95\xff", b"\x80\x02K"])
+def test_bytes_that_are_no_pickle_of_arrays_are_refused(content: bytes) -> None:
+    with pytest.raises(pickle.UnpicklingError):
+        read_arrays(io.BytesIO(content), ADMITTED)
+
+
 def test_missing_weights_are_told_of_metrics_that_need_them(monkeypatch: pytest.MonkeyPatch) -> None:
     def missing() -> None:
         raise FileNotFoundError("LPIPS needs its weights")

@@ -202,6 +202,25 @@ def test_floats_of_other_ranges_are_refused_where_they_are_known(name: str, kind
     assert traced_jit(METRICS[name].function, (prediction * 255, target, *rest)) is not None, "unknown under a trace"
 
 
+@pytest.mark.parametrize(
+    ("place", "frame", "change", "remedy"),
+    [
+        ("middle", 2, lambda video: video * 255, "divide by 255"),
+        ("last", 4, lambda video: video * 2 - 1, r"\(prediction \+ 1\) / 2"),
+        ("first", 0, lambda video: np.where(np.arange(SIDE) == 3, np.nan, video * 255), "divide by 255"),
+    ],
+)
+def test_a_range_that_one_frame_hides_is_seen_in_another(
+    place: str, frame: int, change: Callable[[np.ndarray], np.ndarray], remedy: str
+) -> None:
+    """The others are black or gray, or a pixel is NaN."""
+    video = np.full((5, SIDE, SIDE, 3), 0.5, np.float32)
+    other = video.copy()
+    other[frame] = change(np.linspace(0, 1, SIDE, dtype=np.float32))[:, None]
+    with pytest.raises(ValueError, match=f"the {place} frame of prediction goes from .*{remedy}"):
+        psnr(other, video)
+
+
 def test_masks_of_another_video_are_named() -> None:
     prediction, target, mask = inputs("region")
     with pytest.raises(ValueError, match=r"target_mask is \(1, 31, 31\), expected \(2, 31, 31\)"):

@@ -4,17 +4,22 @@ import json
 import shutil
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from safetensors.numpy import load_file, save_file
 
 from tests import synthetic
 from tests.networks import TINY_CODEC
 from tests.sim_warp.small import TASK, work_inline
+from xew.config import ConfigError
+from xew.dataset import find_accepted
 from xew.episode import EpisodeError, read_record, write_video
 from xew.model import latents
 from xew.model.cache.clips import needed_pixels
 from xew.model.cache.encode import encode_many
+from xew.model.cache.store import open_cache
 from xew.model.codecs.autoencoders import ConvAutoencoderCodec
 from xew.model.codecs.contract import CodecSettings
 from xew.model.conditions import Command
@@ -119,12 +124,34 @@ def test_video_that_is_not_as_long_as_its_episode_is_told(tmp_path: Path, capsys
     (folder,) = synthetic.write_synthetic_data(tmp_path / "data", seeds=(0,), robots=("arx_x5",), frames=7)
     video = stored_pixels(folder, read_record(folder), ("rgb",))["rgb"]
     write_video(folder / "rgb.mkv", video[:5])
-    with pytest.raises(EpisodeError, match=r"rgb.mkv has 5 frames, episode.json says 7; delete the episode"):
+    with pytest.raises(EpisodeError, match=r"arx_x5: rgb has hash \w+, expected \w+ as in its header.*Delete the folder"):
         stored_pixels(folder, read_record(folder), ("rgb",))
     with pytest.raises(SystemExit) as stop:
         latents.main([write_config(tmp_path)])
     assert stop.value.code == 2
-    assert "has 5 frames" in capsys.readouterr().err
+    assert "rgb has hash" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("change", [lambda clips: clips[:-1], lambda clips: clips[..., :-1], lambda clips: clips.sum()])
+def test_latents_of_another_shape_are_refused(change: Any, simulated: Path, tmp_path: Path) -> None:
+    config = [str(simulated / "config.yaml"), "--cache", str(tmp_path / "cache")]
+    latents.main(config)
+    experiment = load_experiment(config[0], config[1:])
+    cache, (_, record) = open_cache(experiment.encoding), find_accepted(simulated / "data")[0]
+    path = cache.path(record, "rgb")
+    assert cache.read(record, "rgb", 0).shape == experiment.inputs.latent_shape
+    save_file({"clips": np.array(change(load_file(path)["clips"]))}, path)
+    with pytest.raises(ConfigError, match=r"is damaged \(its shape is .*, expected .*; delete it and"):
+        cache.read(record, "rgb", 0)
+
+
+def test_a_description_of_the_robot_has_a_length_of_its_own(simulated: Path, tmp_path: Path) -> None:
+    """Nine views are three latent frames, whatever the length of a clip."""
+    config = [str(simulated / "config.yaml"), "--cache", str(tmp_path / "cache"), "--model.embodiment", "nine_views"]
+    latents.main([*config, "--clip.frames", "5"])
+    experiment = load_experiment(config[0], [*config[1:], "--clip.frames", "5"])
+    cache, (_, record) = open_cache(experiment.encoding), find_accepted(simulated / "data")[0]
+    assert cache.read(record, "embodiment", 0).shape == (3, *experiment.inputs.latent_shape[1:])
 
 
 def test_only_what_is_needed_is_read(simulated: Path) -> None:

@@ -12,10 +12,10 @@ import pytest
 from tests import synthetic
 from xew.config import ConfigError
 from xew.dataset import find_records
-from xew.episode import read_video
+from xew.episode import read_record, read_states, read_video, write_episode
 from xew.model import outside
 from xew.model.outside import read_inputs
-from xew.rollout import find_rollouts, read_rollout_video
+from xew.rollout import RolloutError, find_rollouts, read_rollout_video
 
 FRAMES = 9
 MODELS = """
@@ -47,6 +47,18 @@ def importable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.syspath_prepend(str(Path(__file__).parents[2]))
     sys.modules.pop("own_models_of_test", None)
+
+
+@pytest.mark.parametrize("rate", [25.0, 250 / 14])
+def test_rollouts_have_the_rate_of_their_episode(rate: float, data: Path, tmp_path: Path) -> None:
+    folder = data / "place_empty_cup" / "1000000" / "piper"
+    videos = (read_video(folder / f"{name}.mkv") for name in ("rgb", "robot"))
+    write_episode(tmp_path / "data", replace(read_record(folder), frame_rate=rate), read_states(folder), *videos)
+    outside.main(["own_models_of_test:small", "--data", str(tmp_path / "data"), "--out", str(tmp_path / "out")])
+    (rollout,) = find_rollouts(tmp_path / "out")
+    assert len(read_rollout_video(rollout, frame_rate=rate)) == FRAMES
+    with pytest.raises(RolloutError, match=f"has {rate:.2f} frames per second, its episode 16.67"):
+        read_rollout_video(rollout, frame_rate=1000 / 60)
 
 
 def truth(data: Path, made: object) -> np.ndarray:

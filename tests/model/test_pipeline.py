@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from tests import synthetic
 from tests.networks import TINY_CODEC
@@ -36,7 +37,7 @@ clip: {frames: 5, height: 64, width: 80}
 codec: {weights: TINY_CODEC}
 model: {size: tiny, action: joints, embodiment: robot_render,
   history: [], reference: frame, visibility: joint, prediction: velocity, dtype: float32, remat: none}
-train: {steps: 4, batch: 2, learning_rate: 1e-3, log_every: 1, save_every: 2, ema: 0.25, sample_every: 1000,
+train: {steps: 4, batch: 2, learning_rate: 1e-3, log_every: 1, save_every: 2, ema: 0.25, samples: 1,
   optimizer: adamw, warmup_steps: 0, decay_to: 1, motion_loss_weight: 0}
 rollout: {steps: 2, batch: 3,
   sampler: euler}
@@ -82,9 +83,9 @@ def test_resumed_run_repeats_the_straight_one(world: Path, run: Path) -> None:
     config, out = str(world / "config.yaml"), world / "resumed"
     train.main([config, "--out", str(out), "--train.steps", "2"])
     train.main([config, "--out", str(out), "--resume"])
-    assert lines(out, "train/loss") == lines(run, "train/loss")
+    assert lines(out, "loss/train") == lines(run, "loss/train")
     assert lines(out, "train/gradient_norm") == lines(run, "train/gradient_norm")
-    assert len(lines(run, "train/loss")) == 4
+    assert len(lines(run, "loss/train")) == 4
 
 
 def test_sigterm_saves_and_the_rest_repeats(world: Path, run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -99,10 +100,10 @@ def test_sigterm_saves_and_the_rest_repeats(world: Path, run: Path, tmp_path: Pa
     with pytest.raises(SystemExit) as stop:
         train.main([config, "--out", str(out)])
     assert stop.value.code == 143, "a study must not take it for done"
-    assert len(lines(out, "train/loss")) == 3
+    assert len(lines(out, "loss/train")) == 3
     monkeypatch.undo()
     train.main([config, "--out", str(out), "--resume"])
-    assert lines(out, "train/loss") == lines(run, "train/loss")
+    assert lines(out, "loss/train") == lines(run, "loss/train")
 
 
 def test_run_folder_holds_what_a_rerun_needs(run: Path, experiment: Experiment) -> None:
@@ -110,7 +111,16 @@ def test_run_folder_holds_what_a_rerun_needs(run: Path, experiment: Experiment) 
     assert sorted(path.name for path in (run / "checkpoints").iterdir() if path.is_dir()) == ["2", "4"]
     assert {path.name for path in (run / "checkpoints" / "4").iterdir()} >= {"params", "optimizer", "ema", "data"}
     assert list(run.glob("events.out.tfevents.*"))
-    assert lines(run, "sample/psnr/seen/ur5_wsg") and not lines(run, "sample/psnr/unseen/piper")
+
+
+def test_samples_are_graded_next_to_the_pasted_render(run: Path) -> None:
+    for metric in ("lpips", "psnr", "mask_iou", "object_coverage"):
+        (value,), (pasted,) = lines(run, f"validation/{metric}/seen"), lines(run, f"validation/{metric}_of_pasted_render/seen")
+        assert np.isfinite([value, pasted]).all() and value != pasted
+        assert not lines(run, f"validation/{metric}/unseen"), "the data hold no validation body"
+    accumulator = EventAccumulator(str(run))
+    accumulator.Reload()
+    assert "validation/seen/ur5_wsg" in accumulator.Tags()["images"]
 
 
 def test_existing_run_is_not_touched_unasked(world: Path, run: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -118,7 +128,7 @@ def test_existing_run_is_not_touched_unasked(world: Path, run: Path, capsys: pyt
     assert "--resume" in said and "--overwrite" in said
     said = refusal(train.main, [str(world / "config.yaml"), "--resume", "--train.learning-rate", "0.5"], capsys)
     assert "train.learning_rate was 0.001, is 0.5" in said
-    assert len(lines(run, "train/loss")) == 4
+    assert len(lines(run, "loss/train")) == 4
 
 
 def test_missing_data_and_latents_name_the_command(world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -27,12 +27,12 @@ WAN5B = {
     *("model.prediction", "model.weights", "model.text", "model.text_weights", "model.text_tokenizer", "model.remat"),
     *("train.batch", "train.steps", "train.epochs", "train.chunks", "train.optimizer", "train.learning_rate"),
     *("train.warmup_steps", "train.decay_to", "train.ema", "train.motion_loss_weight", "train.log_every", "train.save_every"),
-    *("train.sample_every", "rollout.sampler", "rollout.steps", "rollout.batch"),
+    *("rollout.sampler", "rollout.steps", "rollout.batch"),
 }
 DEBUG = {
     *("out", "clip.frames", "model.size", "model.action", "model.history", "model.dtype", "model.remat"),
     *("train.steps", "train.optimizer", "train.warmup_steps", "train.ema", "train.motion_loss_weight", "train.log_every"),
-    *("train.save_every", "rollout.sampler", "rollout.steps", "rollout.batch", "rollout.max_frames"),
+    *("train.save_every", "train.samples", "rollout.sampler", "rollout.steps", "rollout.batch", "rollout.max_frames"),
 }
 DIFFERS: dict[str, set[str]] = {
     "debug": DEBUG,
@@ -44,7 +44,7 @@ DIFFERS: dict[str, set[str]] = {
     "fewshot/lora": FEWSHOT | {"adapt.lora_rank"},
     "fewshot/replay": FEWSHOT | {"adapt.replay"},
     "wan5b/fixed": WAN5B,
-    "wan5b/fewshot": WAN5B - {"model.weights", "train.sample_every"} | {"adapt.start_from", "adapt.robots"},
+    "wan5b/fewshot": WAN5B - {"model.weights"} | {"adapt.start_from", "adapt.robots", "train.samples"},
 }
 """Settings in which each variant differs from configs/fixed.yaml."""
 

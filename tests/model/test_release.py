@@ -20,7 +20,7 @@ clip: {frames: 5, height: 64, width: 80}
 codec: {weights: TINY_CODEC}
 model: {size: tiny, action: joints, embodiment: robot_render,
   history: [], reference: frame, visibility: joint, prediction: velocity, dtype: float32, remat: none}
-train: {steps: 1, batch: 2, learning_rate: 1e-3, ema: 0.1, log_every: 1, save_every: 1, sample_every: 0,
+train: {steps: 1, batch: 2, learning_rate: 1e-3, ema: 0.1, log_every: 1, save_every: 1, samples: 0,
   optimizer: adamw, warmup_steps: 0, decay_to: 1, motion_loss_weight: 0}
 """.replace("TINY_CODEC", str(TINY_CODEC))
 

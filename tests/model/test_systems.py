@@ -63,7 +63,7 @@ def test_a_system_is_trained_and_rolled_out(world: Path, name: str) -> None:
     made = find_rollouts(world / "rollouts" / name)
     assert [(rolled.robot, rolled.condition) for rolled in made] == [("piper", name)]
     logged = [json.loads(line) for line in (world / name / "metrics.jsonl").read_text().splitlines()]
-    assert np.isfinite([line["train/loss"] for line in logged if "train/loss" in line]).sum() == 2
+    assert np.isfinite([line["loss/train"] for line in logged if "loss/train" in line]).sum() == 2
     scaled = any(condition.scale != "none" for condition in list_conditions(ACTIONS[name]))
     assert (world / name / "scales.json").exists() == scaled
 

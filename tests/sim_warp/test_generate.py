@@ -228,7 +228,7 @@ def test_a_damaged_header_is_told_before_any_work(
     assert line.startswith(f"error: {broken} is damaged") and "delete its folder and run generate again" in line
     shutil.rmtree(broken.parent)
     broken.parent.with_name("franka_panda").rename(broken.parent)
-    assert "move or delete it" in refused(monkeypatch, capsys, *FLAGS, "--out", str(out))
+    assert "in a folder that was copied or renamed" in refused(monkeypatch, capsys, *FLAGS, "--out", str(out))
 
 
 def test_an_imported_episode_does_not_pass_for_a_robot_of_the_same_scene(

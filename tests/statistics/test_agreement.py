@@ -1,4 +1,7 @@
-"""`evaluate` and `report` say the same of the same scores: means, intervals and verdicts, to the last digit."""
+"""`evaluate` and `report` say the same of the same scores: means, intervals and verdicts, to the last digit.
+
+A study's intervals carry a spread between runs besides, which is 0 here.
+"""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -62,7 +65,7 @@ def write_scores(path: Path, scenes: int, truth: bool, spread: float, missing: f
     table.attrs = describe({"protocol": 3, "estimators": {}, "frame_zero": "given", "allowed": []}, tuple(BASE))
     table.attrs["codecs"] = {FLOW: [KEY]}
     table.to_parquet(path)
-    table.to_parquet(path.with_suffix(".curves.parquet"))
+    table.assign(frame=0).to_parquet(path.with_suffix(".curves.parquet"))
     return read_scores(path)
 
 
@@ -154,7 +157,9 @@ def test_tasks_without_power_leave_the_means_of_the_suite_strict_in_both(tmp_pat
     ].mean()
     assert power.loc[("keypoint_error_strict", "task2"), "power"] == pytest.approx(1 / truth)
     variants = rows["model"].where(rows["model"].isin([JOINTS, FLOW]), "")
-    grades = StudyGrades(rows.assign(variant=variants), scores.metrics, paper_axes(read_paper()), codecs=scores.codecs)
+    grades = StudyGrades(
+        rows.assign(variant=variants), scores.metrics, paper_axes(read_paper()), codecs=scores.codecs, assumed_spread=0
+    )
     changed = replace(scores, rows=rows)
     means = summary.means.set_index(["robot", "model", "metric"])
     for robot in ROBOTS:
@@ -186,7 +191,7 @@ def test_a_study_is_the_same_in_both(scores: Scores) -> None:
     means = summary.means.set_index(["robot", "model", "metric"])
     variants = scores.rows["model"].where(scores.rows["model"].isin([JOINTS, FLOW]), "")
     rows = scores.rows.assign(variant=variants)
-    grades = StudyGrades(rows, scores.metrics, paper_axes(read_paper()), codecs=scores.codecs)
+    grades = StudyGrades(rows, scores.metrics, paper_axes(read_paper()), codecs=scores.codecs, assumed_spread=0)
     builder = Builder(grades, None)
     found = dict(pairs_of(summary, JOINTS, FLOW))
     words = set()
@@ -224,7 +229,7 @@ def test_robots_that_are_pooled_are_the_same_in_a_run_and_a_study(tmp_path: Path
     rows["value"] *= 1 - 0.001 * rows.groupby(["model", "task", "seed", "metric"]).cumcount()
     rows = rows.drop_duplicates(["model", "task", "seed", "robot", "metric"])
     variants = rows["model"].where(rows["model"].isin([JOINTS, FLOW]), "")
-    grades = StudyGrades(rows.assign(variant=variants), scores.metrics, paper_axes(read_paper()))
+    grades = StudyGrades(rows.assign(variant=variants), scores.metrics, paper_axes(read_paper()), assumed_spread=0)
     table = robot_table(Scores(rows, scores.curves, scores.metrics, {}), "seen", SEEN_ROBOTS, None)
     for row in table.rows:
         for metric, score in row.scores.items():

@@ -1,23 +1,12 @@
-"""Draws of scenes and of trainings: against what is known, and to the last bit where that is promised."""
+"""Draws of scenes: against what is known, and to the last bit where that is promised."""
 
 import numpy as np
 import pandas as pd
 import pytest
 from scipy import stats
 
-from xew.statistics.bootstrap import (
-    DRAWS,
-    MIN_SCENES,
-    Mean,
-    Units,
-    bootstrap_means,
-    combine,
-    draw_trainings,
-    draw_units,
-    every_draw,
-    find_strata,
-    pool_trainings,
-)
+from xew.statistics import DRAWS, MIN_SCENES, fixed_mean
+from xew.statistics.bootstrap import Units, bootstrap_means, draw_units, every_draw, find_strata
 
 
 def one_task(count: int) -> tuple[int, ...]:
@@ -145,41 +134,6 @@ def test_intervals_of_few_scenes_hold_the_true_mean_as_often_as_they_say(count: 
     assert ((low > 0) | (high < 0)).mean() == pytest.approx(0.05, abs=0.02)
 
 
-def draw_studies(trainings: int, scenes: int, between: float, within: float, studies: int = 200) -> list[Mean]:
-    """Mean differences of two variants that do not differ, of several trainings each that do."""
-    rng, found = np.random.default_rng(10), []
-    for _ in range(studies):
-        pooled = []
-        for variant in ("a", "b"):
-            values = rng.normal(0, between, trainings) + rng.normal(0, within, (scenes, trainings))
-            means = [mean for mean in bootstrap_means(values, np.arange(scenes), one_task(scenes), 499) if mean]
-            several = [("a", trainings), ("b", trainings)] if trainings > 1 else []
-            pooled.append(pool_trainings(means, variant, several))
-        found.append(combine(np.subtract, *pooled))
-    return found
-
-
-def resolved(means: list[Mean]) -> float:
-    """Share of the means whose interval leaves out 0."""
-    ends = np.array([mean.interval() for mean in means])
-    return float(((ends[:, 0] > 0) | (ends[:, 1] < 0)).mean())
-
-
-@pytest.mark.parametrize(("trainings", "between"), [(3, 1.0), (3, 0.02), (5, 0.1)])
-def test_two_levels_hold_the_true_difference_as_often_as_they_say(trainings: int, between: float) -> None:
-    found = draw_studies(trainings, 20, between, 0.3)
-    assert resolved(found) <= 0.08 and {mean.trainings for mean in found} == {trainings}
-
-
-def test_one_training_does_not_say_what_another_would_give() -> None:
-    assert resolved(draw_studies(1, 20, 1.0, 0.3)) > 0.5
-
-
-def test_each_variant_draws_its_own_trainings() -> None:
-    a, b = draw_trainings("a", 3), draw_trainings("b", 3)
-    assert (a[0] == 1).all() and a[1:].sum(axis=1) == pytest.approx(3) and (a != b).any()
-
-
 def test_every_draw_is_counted_once() -> None:
     assert every_draw(2, least=1).tolist() == [[0, 0], [0, 1], [1, 0], [1, 1]]
     assert len(every_draw(3, least=2)) == 24 and len(every_draw(3, least=3)) == 6
@@ -187,7 +141,7 @@ def test_every_draw_is_counted_once() -> None:
 
 def test_printed_means_have_all_that_was_drawn_and_few_scenes_nothing() -> None:
     values = np.array([99.0, *range(101), np.nan])
-    assert Mean(values, 0, None).interval(1.0) == (0, 100) and np.isnan(Mean(values, 5, 5).interval()).all()
-    printed, few = Mean(values, 0, None), Mean(values, 5, 5)
+    assert fixed_mean(values, 0, None).interval(1.0) == (0, 100) and np.isnan(fixed_mean(values, 5, 5).interval()).all()
+    printed, few = fixed_mean(values, 0, None), fixed_mean(values, 5, 5)
     assert (printed.p_above(-1, 1.0), printed.p_above(0, 1.0), printed.p_below(101, 1.0)) == (0, 1, 0)
     assert few.p_above(-1e9) == few.p_below(1e9) == 1

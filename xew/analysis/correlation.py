@@ -1,17 +1,22 @@
-"""Correlation of distance with difficulty over the five leave-one-embodiment-out (LOEO) folds."""
+"""Correlation of distance with difficulty, over the five leave-one-embodiment-out (LOEO) folds or over many bodies.
+
+Every r has the same p: the share of pairings of distances with scores whose |r| is as large. All pairings are tried where they
+are few, else DRAWS of them at random.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import permutations
 
 import numpy as np
 from scipy.stats import rankdata
 
-from xew.statistics import Drawn, every_draw
+from xew.statistics import DRAWS, Drawn, every_draw
 
 FOLDS = 5
-ORDERS = np.array(list(permutations(range(FOLDS))))
-"""All pairings of five distances with five scores [120 5]."""
+FEW = 7
+"""Largest number of robots of which all pairings are tried; there are 5,040 of seven."""
 ROBOT_DRAWS = every_draw(FOLDS, least=3)
 """All draws of five robots with replacement [2820 5] but those of one or two robots, where r is undefined or always +-1."""
 
@@ -26,7 +31,7 @@ class Correlation:
     high: float
     """Largest r when one robot is left out."""
     p_value: float
-    """Exact and two-sided: the share of all pairings of distances with scores whose |r| is as large."""
+    """Exact and two-sided (`permutation_p`)."""
     spearman: float
     """The same of ranks: it asks for order only. Not in the paper."""
     bootstrap_low: float
@@ -91,27 +96,34 @@ def leave_one_out(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     return r.min(axis=-1), r.max(axis=-1)
 
 
-def permutation_p(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Exact two-sided p over the last axis [... 5].
+@lru_cache(maxsize=4)
+def list_orders(count: int) -> np.ndarray:
+    """[m n] int, orders of n scores, as they stand first: all if there are at most FEW, else also DRAWS at random."""
+    if count <= FEW:
+        return np.array(list(permutations(range(count))))
+    drawn = np.tile(np.arange(count), (DRAWS, 1))
+    return np.concatenate([np.arange(count)[None], np.random.default_rng(0).permuted(drawn, axis=1)])
 
-    All 120 orders of the scores are equally likely if distance says nothing. Ties up to rounding count as as large.
+
+def permutation_p(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Two-sided p of Pearson's r over the last axis [... n].
+
+    All orders of the scores are equally likely if distance says nothing. Ties up to rounding count as as large.
     """
-    others = np.abs(pearson(x[..., None, :], y[..., ORDERS]))
+    others = np.abs(pearson(x[..., None, :], y[..., list_orders(y.shape[-1])]))
     return (others >= np.abs(pearson(x, y))[..., None] - 1e-12).mean(axis=-1)
 
 
 def exact_p(statistic: Callable[[np.ndarray], np.ndarray], scores: np.ndarray) -> float:
-    """Exact two-sided p of a statistic of scores [... 5] float64 that are paired with robots.
-
-    It is the share of all 120 orders of the observed scores [5] whose statistic is as far from 0; ties up to rounding count.
-    """
-    others = np.abs(statistic(scores[ORDERS]))
+    """The same of any statistic of scores [... 5] float64 that are paired with robots."""
+    others = np.abs(statistic(scores[list_orders(len(scores))]))
     return float((others >= np.abs(statistic(scores)) - 1e-12).mean())
 
 
 def _bootstrap(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
     """Interval of r over all draws of the robots; those in which something does not vary have no r."""
-    return Drawn(np.concatenate([pearson(x, y)[None], pearson(x[ROBOT_DRAWS], y[ROBOT_DRAWS])])).interval()
+    low, high = Drawn(np.concatenate([pearson(x, y)[None], pearson(x[ROBOT_DRAWS], y[ROBOT_DRAWS])])).interval()
+    return max(low, -1.0), min(high, 1.0)
 
 
 def _folds(distance: Sequence[float], score: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:

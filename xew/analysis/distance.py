@@ -8,7 +8,6 @@ Writes <out>/distances.csv (axis and pair of robots) and <out>/robots.csv (robot
 paper's value. The spread is the standard deviation over draws of configurations, of appearance the jackknife's over views.
 """
 
-import importlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -39,8 +38,8 @@ from xew.analysis.distances.workspaces import (
     workspace,
     workspace_cloud,
 )
-from xew.config import ConfigError, user_errors
-from xew.files import hold_lock, replacing
+from xew.config import ConfigError, import_named, user_errors
+from xew.files import hold_lock, write_text
 from xew.names import csv_text
 from xew.protocol import ROBOT_NAMES, expand_robots
 from xew.sim_warp.robots import RobotSpec, Urdf, get_robot, load_urdf
@@ -173,17 +172,15 @@ def _find_robot(name: str) -> RobotSpec | Urdf:
 
 
 def _import_embedding(name: str) -> ImageEmbedding:
-    module, _, attribute = name.partition(":")
     try:
-        return getattr(importlib.import_module(module), attribute)
+        return import_named(name)
     except (ImportError, AttributeError, ValueError) as error:
         raise ConfigError(f"--perceptual {name!r} cannot be imported: {error}; expected module:NAME, or nothing.") from error
 
 
 def _write(frame: pd.DataFrame, path: Path) -> None:
     try:
-        with replacing(path) as temporary:
-            temporary.write_text(csv_text(frame))
+        write_text(path, csv_text(frame), within=path.parent)
     except OSError as error:
         raise ConfigError(f"cannot write {path}: {error}. Choose another --out.") from error
 

@@ -17,7 +17,6 @@ The figures lie in `paper.json` with the table that each is from:
 `lab/paper_figures` rebuilds the correlations and percentages from the scores and distances.
 """
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
@@ -29,6 +28,7 @@ import numpy as np
 from xew.analysis.correlation import Correlation, loeo_correlation
 from xew.analysis.scores import MetricInfo
 from xew.config import parse
+from xew.files import read_json
 
 PAPER = Path(__file__).with_name("paper.json")
 AXES = ("appearance", "kinematic")
@@ -148,7 +148,7 @@ class Paper:
 @cache
 def read_paper() -> Paper:
     """The figures that come with the package."""
-    return parse(Paper, json.loads(PAPER.read_text()), str(PAPER))
+    return parse(Paper, read_json(PAPER), str(PAPER))
 
 
 PAPER_TITLES = {name: metric.title for name, metric in read_paper().metrics.items()}

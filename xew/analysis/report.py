@@ -53,11 +53,11 @@ from xew.analysis.tables.table import (
 )
 from xew.config import ConfigError, user_errors
 from xew.dataset import demand_one_motion, find_records
-from xew.episode import Record, episode_folder, read_video
+from xew.episode import Record, episode_folder, read_pixels
 from xew.files import hold_lock, write_bytes, write_text
-from xew.names import csv_text, path_below, plain_markdown
+from xew.names import csv_text, plain_markdown
 from xew.protocol import BASELINES, HELD_OUT_ROBOTS, ROBOT_NAMES, seed_split
-from xew.rollout import Rollout, find_rollouts, read_rollout_video
+from xew.rollout import Rollout, find_rollouts, read_as_graded
 from xew.statistics import MIN_SCENES, find_parting, strict_metrics
 
 TITLE = "Can the model render a robot that it has never seen?"
@@ -391,8 +391,8 @@ def _make_strip(row: pd.Series, word: str, rollouts: Rollouts, data: Path, frame
     key = _rollout_key(row)
     if key not in rollouts:
         raise ConfigError(f"the rollout {' '.join(map(str, key))} is graded but not under --rollouts; name its tree too.")
-    observed = read_video(episode_folder(data, *key[2:]) / "rgb.mkv")
-    predicted = pictures.fit_to_episode(read_rollout_video(rollouts[key]), observed, frame_zero)
+    observed = read_pixels(episode_folder(data, *key[2:]), "rgb")
+    predicted = read_as_graded(rollouts[key], observed, frame_zero != "absent")
     times = pictures.strip_times(int(row["frames"]))
     image = pictures.encode_png(pictures.strip(observed, predicted, times))
     title = f"{robot_title(row['robot'])}, {row['task']}"
@@ -444,10 +444,10 @@ def _write_report(out: Path, html: str, markdown: tuple[str, Mapping[str, bytes]
     text, files = markdown
     try:
         for name, content in files.items():
-            write_bytes(path_below(out, name), content)
-        write_text(out / "report.md", text)
-        write_text(out / "summary.csv", csv_text(summary))
-        write_text(out / "index.html", html)
+            write_bytes(out / name, content, within=out)
+        write_text(out / "report.md", text, within=out)
+        write_text(out / "summary.csv", csv_text(summary), within=out)
+        write_text(out / "index.html", html, within=out)
     except OSError as error:
         raise ConfigError(f"cannot write the report to {out}: {error}. Choose another --out.") from error
 

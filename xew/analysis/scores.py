@@ -5,17 +5,20 @@ is empty for baselines. The column `training` holds the seed of the training run
 was trained once.
 """
 
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
+import pyarrow.compute as pc
+from pyarrow import parquet
 
 from xew.config import IMPORT_PATH, ConfigError, parse
-from xew.files import demand_regular, replacing
-from xew.names import EpisodeError, check_label, check_name
+from xew.files import demand_regular, parse_json, replacing
+from xew.names import MOST_LETTERS, EpisodeError, check_label, check_name
 from xew.protocol import BASELINES, BODY_NAME, COPY_FIRST_FRAME, GROUND_TRUTH, ROBOT_NAMES, SHARED_MOTION
 
 VARIANT = "variant"
@@ -25,6 +28,17 @@ EPISODE = ["task", "seed", "robot"]
 KEY = ["model", "condition", *EPISODE]
 NAMES = [VARIANT, "model", "condition", "task", "robot", "metric"]
 COLUMNS = [*KEY, "metric", "value", "frames", "exact_frames"]
+CURVE_COLUMNS = [*KEY, "metric", "frame", "value"]
+TYPES: dict[str, tuple[str, Callable[[pa.DataType], bool]]] = {
+    **dict.fromkeys((*NAMES, "content"), ("text", lambda kind: pa.types.is_string(kind) or pa.types.is_large_string(kind))),
+    **dict.fromkeys(("seed", "frames", "exact_frames", "frame", TRAINING), ("whole numbers", pa.types.is_integer)),
+    "value": ("numbers", lambda kind: pa.types.is_integer(kind) or pa.types.is_floating(kind)),
+}
+"""Content of the columns, in words and as a test of their type; other columns are not read."""
+SMALL_TABLE = 2**20
+"""Number of rows, and of bytes of content, that a file of any size may declare."""
+MOST_ROWS, MOST_BYTES = 10, 100
+"""Largest number of rows, and of bytes of content, that a file may declare per byte of its size."""
 COPY, TRUTH = COPY_FIRST_FRAME, GROUND_TRUTH
 """Baselines that others are measured by: the frozen first frame, and the true video, which is the ceiling."""
 COMPARABLE = ("protocol", "metrics", "estimators", "frame_zero", "motion")
@@ -60,6 +74,11 @@ class MetricInfo:
     def __post_init__(self) -> None:
         if not self.title:
             object.__setattr__(self, "title", self.name)
+
+    @property
+    def range(self) -> tuple[float, float]:
+        """Smallest and largest score that is possible; infinite where there is none."""
+        return -np.inf if self.low is None else self.low, np.inf if self.high is None else self.high
 
     @property
     def leaves_tasks(self) -> bool:
@@ -143,11 +162,9 @@ def read_scores(path: Path, own_robots: Sequence[str] = ()) -> Scores:
         ConfigError: a file is missing or damaged, or rows cannot be averaged over; the message names them.
     """
     command = EVALUATE.format(path=path)
-    rows, by_frame = _read(path, command), path.with_suffix(".curves.parquet")
-    curves = _read(by_frame, command) if by_frame.exists() else rows.iloc[:0].assign(frame=0)
-    missing = [column for column in COLUMNS if column not in rows]
-    missing += [key for key in ("protocol", "metrics") if key not in rows.attrs]
-    if missing:
+    rows, by_frame = _read(path, COLUMNS, command), path.with_suffix(".curves.parquet")
+    curves = _read(by_frame, CURVE_COLUMNS, command) if by_frame.exists() else rows.iloc[:0].assign(frame=0)
+    if missing := [key for key in ("protocol", "metrics") if key not in rows.attrs]:
         raise ConfigError(f"{path} has no {', '.join(missing)}; it is no score table of xew. Make one: {command}")
     if rows.empty:
         raise ConfigError(f"{path} holds no row. Grade some rollouts: {command}")
@@ -159,7 +176,7 @@ def read_scores(path: Path, own_robots: Sequence[str] = ()) -> Scores:
     known |= {robot for robot in names if IMPORT_PATH.fullmatch(str(robot)) or BODY_NAME.fullmatch(str(robot))}
     wrong = _find_wrong_rows(rows, metrics, known)
     if wrong:
-        raise ConfigError(f"{path} cannot be averaged over:\n{_format_wrong_rows(wrong)}\nGrade again: {command} --overwrite")
+        raise ConfigError(f"{path} cannot be averaged over:", *_list_wrong_rows(wrong), f"Grade again: {command} --overwrite")
     return Scores(rows, curves, metrics, rows.attrs)
 
 
@@ -196,9 +213,8 @@ def merge_scores(tables: Sequence[tuple[str, Path]], trainings: Sequence[int] = 
     wrong = _find_wrong_rows(merged, metrics, set(merged["robot"]))
     if wrong:
         paths = ", ".join(str(path) for _, path in tables)
-        raise ConfigError(
-            f"the score tables {paths} do not match:\n{_format_wrong_rows(wrong)}\nGrade them again from one data set."
-        )
+        again = "Grade them again from one data set."
+        raise ConfigError(f"the score tables {paths} do not match:", *_list_wrong_rows(wrong), again)
     return Scores(merged, _stack_compact_tables(curves), metrics, common)
 
 
@@ -212,7 +228,7 @@ def write_scores(scores: Scores, path: Path) -> None:
         for frame, file in ((scores.curves, path.with_suffix(".curves.parquet")), (scores.rows, path)):
             frame = frame.copy(deep=False)
             frame.attrs = dict(scores.attributes)
-            with replacing(file) as temporary:
+            with replacing(file, within=file.parent) as temporary:
                 frame.to_parquet(temporary, index=False)
     except OSError as error:
         raise ConfigError(f"cannot write {path}: {error}. Free some space or choose another place.") from error
@@ -238,15 +254,59 @@ def describe_scores(cells: pd.DataFrame, most: int = LISTED) -> str:
     return shown + (f"; and {len(cells) - most} more" if len(cells) > most else "")
 
 
-def _read(path: Path, command: str) -> pd.DataFrame:
+def _read(path: Path, columns: Sequence[str], command: str) -> pd.DataFrame:
+    """The known columns of a table. Raises ConfigError if one of `columns` is missing, or as `read_scores`."""
     if path.is_dir():
         raise ConfigError(f"{path} is a folder; name a score table, or make one: {EVALUATE.format(path='scores.parquet')}")
     try:
-        return pd.read_parquet(demand_regular(path))
+        schema = parquet.read_schema(demand_regular(path))
+        if missing := [column for column in columns if column not in schema.names]:
+            raise ConfigError(f"{path} has no {', '.join(missing)}; it is no score table of xew. Make one: {command}")
+        return _read_columns(path, schema)
     except FileNotFoundError as error:
         raise ConfigError(f"{path} does not exist; make it: {command}") from error
-    except (OSError, ValueError, TypeError, AttributeError, RecursionError) as error:  # the latter of damaged attributes
+    except (OSError, ValueError, TypeError, KeyError, RecursionError, pa.ArrowException) as error:
         raise ConfigError(f"{path} cannot be read ({error}); delete it and make it again: {command}") from error
+
+
+def _read_columns(path: Path, schema: pa.Schema) -> pd.DataFrame:
+    """The columns of TYPES. Raises ValueError if one is of another type or larger than its file can hold."""
+    known = pa.schema([_check_type(field) for field in schema if field.name in TYPES])
+    # Read as dictionaries, a long text that many rows repeat takes memory once.
+    with parquet.ParquetFile(path, read_dictionary=[name for name in known.names if TYPES[name][0] == "text"]) as file:
+        _check_size(file.metadata, path.stat().st_size)
+        table = file.read(columns=known.names)
+    for name, column in zip(table.column_names, table.columns, strict=True):
+        _check_cells(name, column)
+    frame: pd.DataFrame = table.cast(known).to_pandas()
+    frame.attrs = parse_json((schema.metadata or {}).get(b"PANDAS_ATTRS", b"{}"))
+    return frame
+
+
+def _check_type(column: pa.Field) -> pa.Field:
+    """The same column. Raises ValueError if it is of another type than TYPES says; in a table without rows it has none."""
+    kind, (what, fits) = column.type, TYPES[column.name]
+    value = kind.value_type if pa.types.is_dictionary(kind) else kind
+    if not (fits(value) or pa.types.is_null(value)):
+        raise ValueError(f"its column {column.name} is of type {kind}, expected {what}")
+    return column
+
+
+def _check_size(declared: parquet.FileMetaData, size: int) -> None:
+    """Raise ValueError if a file of `size` bytes declares too many rows or too much content."""
+    content = sum(declared.row_group(group).total_byte_size for group in range(declared.num_row_groups))
+    if declared.num_rows > max(SMALL_TABLE, MOST_ROWS * size) or content > max(SMALL_TABLE, MOST_BYTES * size):
+        raise ValueError(f"it declares {declared.num_rows} rows and {content} bytes, too many for a file of {size} bytes")
+
+
+def _check_cells(name: str, column: pa.ChunkedArray) -> None:
+    """Raise ValueError if a column has empty cells, except of values, or a text that is too long for a name."""
+    if column.null_count and name != "value":
+        raise ValueError(f"its column {name} has empty cells")
+    if pa.types.is_dictionary(column.type):
+        longest = max((pc.max(pc.binary_length(chunk.dictionary)).as_py() or 0 for chunk in column.chunks), default=0)
+        if longest > 4 * MOST_LETTERS:  # bytes of a letter
+            raise ValueError(f"its column {name} has a text of {longest} bytes, expected at most {MOST_LETTERS} letters")
 
 
 def _check_texts(path: Path, rows: pd.DataFrame) -> None:
@@ -320,8 +380,8 @@ def _find_wrong_rows(rows: pd.DataFrame, metrics: Sequence[MetricInfo], robots: 
     return {reason: rows[mask] for reason, mask in found.items() if mask.any()}
 
 
-def _format_wrong_rows(wrong: Mapping[str, pd.DataFrame]) -> str:
-    return "\n".join(f"  {reason}, {len(cells)} rows: {describe_scores(cells)}" for reason, cells in wrong.items())
+def _list_wrong_rows(wrong: Mapping[str, pd.DataFrame]) -> list[str]:
+    return [f"  {reason}, {len(cells)} rows: {describe_scores(cells)}" for reason, cells in wrong.items()]
 
 
 def _merge_attributes(tables: Sequence[tuple[Path, Mapping[Hashable, Any]]]) -> dict[Hashable, Any]:
@@ -330,10 +390,10 @@ def _merge_attributes(tables: Sequence[tuple[Path, Mapping[Hashable, Any]]]) -> 
     for key in COMPARABLE:
         values = [attributes.get(key) for _, attributes in tables]
         if any(value != values[0] for value in values):
-            found = "\n".join(f"  {path}: {value}" for (path, _), value in zip(tables, values, strict=True))
             raise ConfigError(
-                f"the score tables differ in {key}, so their numbers do not compare:\n{found}\n"
-                f"Grade all by the same version and options: {EVALUATE.format(path='SCORES')} --overwrite"
+                f"the score tables differ in {key}, so their numbers do not compare:",
+                *(f"  {path}: {value}" for (path, _), value in zip(tables, values, strict=True)),
+                f"Grade all by the same version and options: {EVALUATE.format(path='SCORES')} --overwrite",
             )
     packages = dict.fromkeys(name for _, attributes in tables for name in attributes.get("versions", {}))
     used = {name: {attributes.get("versions", {}).get(name, "none") for _, attributes in tables} for name in packages}

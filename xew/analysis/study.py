@@ -27,6 +27,7 @@ from xew.analysis.studies.ledger import Ledger
 from xew.analysis.studies.machines import open_machines, usable_gpus
 from xew.analysis.studies.merge import merge_piece
 from xew.analysis.studies.plan import Step, plan, write_configs
+from xew.analysis.studies.power import format_power
 from xew.analysis.studies.runner import Budget, StudyRunner
 from xew.analysis.studies.status import exit_with_failures, format_cost, format_status
 from xew.config import ConfigError, admit_named, load, read_yaml, save, suggestion, user_errors
@@ -56,6 +57,9 @@ class Args:
     """The study that the file describes, with overrides."""
     dry_run: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Show what is done, what is left and its cost, and run nothing."""
+    scores: Annotated[Path | None, tyro.conf.arg(metavar="{None}|PATH")] = None
+    """Score table of an earlier study: --dry-run also estimates how many runs, scenes and bodies each claim needs. Default: the
+    study's own, if it exists."""
     redo: Annotated[tuple[str, ...], tyro.conf.arg(metavar="STEP [STEP ...]")] = ()
     """Run these steps again, such as 'train/loeo_*'."""
     minutes: Annotated[float | None, tyro.conf.arg(metavar="{None}|FLOAT")] = None
@@ -77,6 +81,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         check_configs([study.experiment])
         slots = len(usable_gpus(study)) or study.machine.workers
         print(format_status(study, steps, ledger), format_cost(study, steps, ledger, slots), sep="\n\n")
+        earlier = args.scores or study.out / "scores.parquet"
+        if args.scores or earlier.exists():
+            print(f"\n{format_power(earlier)}")
         return
     with lock_study(study.out), stop_on_sigterm():
         prepare(study)
@@ -84,7 +91,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             ledger.forget(step)
         failed = merge_pieces(steps, ledger, args.merge) if args.merge else run_steps(args, steps, ledger)
         table = format_status(study, steps, ledger, failed)
-        write_text(study.out / "status.txt", table + "\n")
+        write_text(study.out / "status.txt", table + "\n", within=study.out)
     print(table)
     if failed:
         exit_with_failures(failed, ledger, steps)
@@ -143,10 +150,11 @@ def prepare(study: Study) -> None:
 
 def check_configs(paths: Sequence[Path]) -> None:
     """Raises ConfigError if the model does not accept one of these experiments, or metrics lack their weights."""
-    checked = subprocess.run([sys.executable, "-c", CHECK_CONFIGS, *map(str, paths)], capture_output=True, text=True)
+    command = [sys.executable, "-c", CHECK_CONFIGS, *map(str, paths)]
+    checked = subprocess.run(command, capture_output=True, encoding="utf-8", errors="replace")
     if checked.returncode:
         message = checked.stderr.strip().removeprefix("error: ")
-        raise ConfigError(f"the study's experiments cannot be run here.\n{message}")
+        raise ConfigError("the study's experiments cannot be run here.", *message.splitlines())
 
 
 def check_kinds(names: Sequence[str]) -> None:

@@ -1,34 +1,41 @@
 """Reader of RoboTwin's HDF5 files: `read_robotwin(path)` gives one episode in xew's conventions.
 
-It reads the legacy layout (observation/, joint_action/, endpose/) and the layout of version 1.0 (vision/, state/). RoboTwin
-encodes RGB arrays as JPEG as if they were BGR: OpenCV decodes them to RGB. Newer files mark ordinary JPEGs by a comment; these
-are converted from BGR. RoboTwin's quaternions are w x y z.
+It reads the legacy layout (observation/, joint_action/, endpose/) and the layout of version 1.0 (vision/, state/), which
+RoboDojo and other projects of XPolicyLab share. Its quaternions are w x y z. What a file does not say can be given by
+`ReadOptions`.
 """
 
-import json
-from collections.abc import Sequence
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import h5py
 import numpy as np
 
-from xew.episode import HEIGHT, WIDTH, EpisodeError
-from xew.files import demand_regular, read_text
+from xew.episode import WIDTH, EpisodeError
+from xew.exchange.pictures import Colors, read_pictures
+from xew.files import demand_regular, parse_json, read_text
 from xew.protocol import FRAME_RATE
 
 TOOL_OFFSET = 0.12
 """Distance of RoboTwin's end pose behind the tool center point, along the approach [m], for all robots."""
 STEPS_PER_SECOND = 250
 """Rate of RoboTwin's simulation [Hz]. The key `frequency` of its files is the number of steps between frames: 15."""
+FREQUENCY = "additional_info/frequency"
+"""Name of the frame rate: steps of RoboTwin's simulation between frames, in other projects' files frames per second."""
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 """From OpenGL's camera frame (y up, z backward) to OpenCV's (y down, z forward), and back."""
-RGB_MARK = b"XPL-RGB1"
-"""JPEG comment of pictures that are ordinary JPEGs."""
-LARGEST_RATIO = 2000
-"""Largest ratio of an array's size to its file's size; compression makes zeros a thousand times smaller."""
+LARGEST_ARRAY = 16_000_000
+"""Largest size of an array of numbers or texts [bytes]: two hours of 16 numbers at 16.67 Hz."""
+LARGEST_GROWTH = 500
+"""Largest ratio of the decoded or declared size of pictures to their file's size; a JPEG of one color grows 150 times."""
+INSTRUCTIONS = ("seen", "unseen", "instructions", "instruction")
+"""Keys of instructions in RoboTwin's JSON files; the first that holds a text is read."""
+LARGEST_ANGLE = 4 * math.pi
+"""Angle of a joint [rad] above which it is in degrees."""
+GRIPPER_MARGIN = 0.1
+"""Largest value by which a gripper's command leaves the range from 0 to 1."""
 TABLE_CENTER = (0.0, 0.0, 0.74)
 """Point that every head camera sees, world frame [m]."""
 
@@ -55,6 +62,21 @@ class Recorded:
     """Instruction; empty if there is none."""
     frame_rate: float
     """Frames per second."""
+
+
+@dataclass(frozen=True)
+class ReadOptions:
+    """What a file does not say, or says wrongly; None reads it from the file."""
+
+    frame_rate: float | None = None
+    """Frames per second."""
+    colors: Colors = "marked"
+    """Encoding of the pictures."""
+    instruction: str | None = None
+    """The text; it may be empty."""
+
+
+READ_ALL = ReadOptions()
 
 
 @dataclass(frozen=True)
@@ -87,24 +109,34 @@ MODERN = Layout(
     end_poses=("state/left_ee_poses", "state/right_ee_poses"),
     pictures="vision/cam_head/colors",
     intrinsics="vision/cam_head/intrinsic_matrix",
-    extrinsics=("vision/cam_head/extrinsics_matrix",),
+    extrinsics=("vision/cam_head/extrinsic_matrix", "vision/cam_head/extrinsics_matrix"),
 )
 """Version 1.0: `state` is in force at a frame; `action` is the state of the next frame and is not read."""
 
 
-def read_robotwin(path: Path) -> Recorded:
+FOREIGN = {
+    "an episode of ALOHA or ACT": ("observations/qpos", "observations/images"),
+    "demonstrations of robomimic or LIBERO": ("data/demo_0", "data/demo_1"),
+}
+"""Contents of other projects' HDF5 files, and datasets or groups of which one shows them."""
+
+
+def read_robotwin(path: Path, options: ReadOptions = READ_ALL) -> Recorded:
     """Read an episode of either layout.
 
     Raises:
-        EpisodeError: the file is not HDF5, truncated or incomplete, or an array has a wrong shape.
+        EpisodeError: the file is not HDF5, truncated, incomplete or of another project, an array has a wrong shape, or the file
+            does not say what an option must then say.
     """
     try:
         with h5py.File(demand_regular(path), "r") as file:
             demand_whole(path, file)
             reader = _Reader(path, file)
-            return _read(reader, MODERN if "state" in file else LEGACY)
+            return _read(reader, _find_layout(path, file), options)
     except EpisodeError:
         raise
+    except BlockingIOError as error:
+        raise EpisodeError(f"{path} is open in another program, which may still write it; close it there.") from error
     except Exception as error:  # h5py raises OSError, RuntimeError and others for damaged files
         raise EpisodeError(f"{path} cannot be read as HDF5 ({' '.join(str(error).split())}); copy it again.") from error
 
@@ -113,13 +145,12 @@ def demand_whole(path: Path, file: h5py.File) -> None:
     """Check, before reading, that a file holds all of its data itself.
 
     HDF5 can refer to other files by external links, external storage and virtual datasets, and its library would open any file
-    of this machine. An array without stored data can have any size.
+    of this machine.
 
     Raises:
-        EpisodeError: the file refers to another file, or an array is larger than the file can hold.
+        EpisodeError: the file refers to another file.
     """
     problems: list[str] = []
-    size = path.stat().st_size
 
     def check(name: str, link: Any) -> None:
         if not isinstance(link, (h5py.HardLink, h5py.SoftLink)):
@@ -130,15 +161,23 @@ def demand_whole(path: Path, file: h5py.File) -> None:
             problems.append(f"{name} is put together from other files (a virtual dataset)")
         elif isinstance(stored, h5py.Dataset) and stored.external:
             problems.append(f"{name} is stored in another file")
-        elif isinstance(stored, h5py.Dataset) and stored.nbytes > LARGEST_RATIO * size:
-            problems.append(f"{name} has {stored.nbytes:,} bytes, of a file of {size:,}")
 
     file.visititems_links(check)
     if problems:
         raise EpisodeError(f"{path}: {problems[0]}; expected a file that holds all of its data itself.")
 
 
-def _read(reader: "_Reader", layout: Layout) -> Recorded:
+def _find_layout(path: Path, file: h5py.File) -> Layout:
+    for content, names in FOREIGN.items():
+        if any(name in file for name in names):
+            raise EpisodeError(
+                f"{path} holds {content}, expected an episode of RoboTwin; to train on both, convert it and xew's episodes "
+                "to LeRobot's format, as docs/exchange.md says."
+            )
+    return MODERN if "state" in file else LEGACY
+
+
+def _read(reader: "_Reader", layout: Layout, options: ReadOptions) -> Recorded:
     arms = [reader.numbers(name, 2) for name in layout.arms]
     grippers = [reader.column(name) for name in layout.grippers]
     poses = (
@@ -150,9 +189,13 @@ def _read(reader: "_Reader", layout: Layout) -> Recorded:
         raise reader.error(f"arms, grippers and end poses have {counts} frames", "as many of each, at least one")
     if arms[0].shape != arms[1].shape or arms[0].shape[1] not in (6, 7):
         raise reader.error(f"the arms have {arms[0].shape[1]} and {arms[1].shape[1]} joints", "six or seven each")
+    if (angle := np.abs(arms).max()) > LARGEST_ANGLE:
+        raise reader.error(f"the arms' joints reach {angle:.0f}", "radians")
+    if np.min(grippers) < -GRIPPER_MARGIN or np.max(grippers) > 1 + GRIPPER_MARGIN:
+        raise reader.error(f"the grippers go from {np.min(grippers):g} to {np.max(grippers):g}", "0 (closed) to 1 (open)")
     if any(pose.shape[1] != 7 for pose in poses):
         raise reader.error("the end poses have another shape", "[frames 7]")
-    rgb = reader.pictures(layout.pictures, frames)
+    rgb, width = reader.pictures(layout.pictures, frames, options.colors)
     if any(np.abs(np.linalg.norm(pose[:, 3:], axis=1) - 1).max() > 0.01 for pose in poses):
         raise reader.error("the end poses hold quaternions that are not of length 1", "x y z and a unit quaternion w x y z")
     matrix = reader.constant(layout.intrinsics, (3, 3))
@@ -160,18 +203,17 @@ def _read(reader: "_Reader", layout: Layout) -> Recorded:
         raise reader.error(
             f"{layout.intrinsics} has the focal lengths {matrix[0, 0]:g} and {matrix[1, 1]:g}", "numbers of pixels over 0"
         )
-    scale = rgb.shape[2] / WIDTH
     extrinsics = next((name for name in layout.extrinsics if name in reader.file), layout.extrinsics[0])
     return Recorded(
         layout.name,
         np.stack(arms, 1),
         np.stack(grippers, 1),
         np.stack([tool_center(pose) for pose in poses], 1) if poses else None,
-        np.stack([cv2.resize(image, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA) for image in rgb]) if scale != 1 else rgb,
-        _center_pixels(matrix, scale),
+        rgb,
+        _center_pixels(matrix, width / WIDTH),
         _world_to_camera(reader, extrinsics),
-        reader.instruction(),
-        reader.frame_rate("additional_info/frequency"),
+        reader.instruction() if options.instruction is None else options.instruction,
+        reader.frame_rate(layout) if options.frame_rate is None else options.frame_rate,
     )
 
 
@@ -180,15 +222,6 @@ def tool_center(end_pose: np.ndarray) -> np.ndarray:
     w, x, y, z = end_pose[:, 3:].T
     approach = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], 1)
     return np.concatenate([end_pose[:, :3] + TOOL_OFFSET * approach, end_pose[:, [4, 5, 6, 3]]], 1)
-
-
-def decode_picture(encoded: bytes) -> np.ndarray | None:
-    """An encoded picture as uint8 RGB [h w 3]; None if it cannot be decoded."""
-    image = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_COLOR)
-    if image is None:
-        return None
-    is_ordinary = RGB_MARK in encoded[:4096]
-    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB) if is_ordinary else image
 
 
 def _center_pixels(intrinsics: np.ndarray, scale: float) -> np.ndarray:
@@ -231,13 +264,22 @@ class _Reader:
     path: Path
     file: h5py.File
 
-    def dataset(self, name: str) -> h5py.Dataset:
+    @property
+    def size(self) -> int:
+        """Size of the file [bytes]."""
+        return self.path.stat().st_size
+
+    def dataset(self, name: str, largest: int = LARGEST_ARRAY) -> h5py.Dataset:
+        """A dataset of at most `largest` bytes, because one without stored data can declare any size."""
         dataset = self.file.get(name)
         if not isinstance(dataset, h5py.Dataset):
             known = ", ".join(sorted(self.file)) or "nothing"
             raise EpisodeError(
                 f"{self.path} has no {name} (at its top: {known}); expected a RoboTwin episode of the legacy or the 1.0 layout."
             )
+        declared = max(dataset.nbytes, math.prod(dataset.chunks or (0,)) * dataset.dtype.itemsize)  # a chunk is read whole
+        if declared > largest:
+            raise self.error(f"{name} declares {declared:,} bytes, of a file of {self.size:,}", f"at most {largest:,}")
         return dataset
 
     def numbers(self, name: str, dimensions: int) -> np.ndarray:
@@ -257,14 +299,28 @@ class _Reader:
             raise self.error(f"{name} has shape {array.shape}", "[frames 1]: a gripper of one number")
         return array.reshape(len(array))
 
-    def frame_rate(self, name: str) -> float:
-        """Frames per second, from the stored number of simulation steps between frames; default: FRAME_RATE."""
-        if name not in self.file:
+    def frame_rate(self, layout: Layout) -> float:
+        """Frames per second by `FREQUENCY`; RoboTwin's default rate without it."""
+        counts_steps = layout is LEGACY or self.is_robotwin
+        if FREQUENCY not in self.file:
+            if not counts_steps:
+                raise self.error(f"there is no {FREQUENCY}, and the file is not RoboTwin's", "--frame-rate HZ")
             return FRAME_RATE
-        steps = self.numbers(name, self.dataset(name).ndim).reshape(-1)
-        if len(steps) != 1 or not 1 <= steps[0] <= STEPS_PER_SECOND:
-            raise self.error(f"{name} is {steps.tolist()}", f"one number of steps of {1000 / STEPS_PER_SECOND:g} ms, 1 to 250")
-        return STEPS_PER_SECOND / float(steps[0])
+        stored = self.numbers(FREQUENCY, self.dataset(FREQUENCY).ndim).reshape(-1)
+        if len(stored) != 1 or not 1 <= stored[0] <= STEPS_PER_SECOND:
+            raise self.error(f"{FREQUENCY} is {stored.tolist()}", f"one number from 1 to {STEPS_PER_SECOND}")
+        number = float(stored[0])
+        if not counts_steps and "instruction" not in self.file:
+            raise self.error(
+                f"{FREQUENCY} is {number:g}, which may count steps of {1000 / STEPS_PER_SECOND:g} ms between frames, or frames",
+                f"--frame-rate {STEPS_PER_SECOND / number:g} or --frame-rate {number:g}",
+            )
+        return STEPS_PER_SECOND / number if counts_steps else number
+
+    @property
+    def is_robotwin(self) -> bool:
+        """Whether RoboTwin's converter wrote the file: it says so, or has `instructions` where others have `instruction`."""
+        return str(self.file.attrs.get("source_format")) == "RoboTwin" or "instructions" in self.file
 
     def constant(self, name: str, shape: tuple[int, ...] | None) -> np.ndarray:
         """A matrix [r c], stored once or equal for every frame."""
@@ -276,29 +332,45 @@ class _Reader:
             raise self.error(f"{name} changes during the episode", "a camera that stands still")
         return first
 
-    def pictures(self, name: str, frames: int) -> np.ndarray:
-        """Decoded pictures [t h w 3] uint8 RGB."""
-        stored = self.dataset(name)
-        if len(stored) != frames:
-            raise self.error(f"{name} has {len(stored)} pictures", f"one for each of {frames} frames")
-        decoded = []
-        for frame, entry in enumerate(stored[()]):
-            encoded = entry.tobytes() if isinstance(entry, np.ndarray) else bytes(entry)
-            image = decode_picture(encoded)
-            if image is None:
-                raise self.error(f"{name}, frame {frame}, cannot be decoded", "a JPEG picture")
-            decoded.append(image)
-        sizes = {image.shape[:2] for image in decoded}
-        if len(sizes) > 1 or next(iter(sizes))[1] * HEIGHT != next(iter(sizes))[0] * WIDTH:
-            raise self.error(f"{name} holds pictures of (height, width) {sorted(sizes)}", f"one size, {WIDTH}:{HEIGHT}")
-        return np.stack(decoded)
+    def pictures(self, name: str, frames: int, colors: Colors) -> tuple[np.ndarray, int]:
+        """`read_pictures` of a dataset, if its header promises no more than the file can hold."""
+        largest = max(LARGEST_GROWTH * self.size, LARGEST_ARRAY)
+        stored = self.dataset(name, largest)
+        if stored.ndim == 0 or len(stored) != frames:
+            raise self.error(f"{name} has {stored.size} pictures", f"one for each of {frames} frames")
+        if stored.dtype.itemsize > self.size:
+            raise self.error(
+                f"{name} promises pictures of {stored.dtype.itemsize:,} bytes", f"at most the file's {self.size:,}"
+            )
+        try:
+            return read_pictures(stored, colors, largest)
+        except ValueError as error:
+            raise EpisodeError(f"{self.path}: {name} {error}.") from error
 
     def instruction(self) -> str:
         """The first instruction in the file, or in the episode's separate instruction file."""
-        stored = self.file.get("instructions")
-        if isinstance(stored, h5py.Dataset):
-            return _first_instruction(_as_text(stored[()]))
-        return _first_instruction(text_beside(self.path, f"instructions/{self.path.stem}.json"))
+        beside = f"instructions/{self.path.stem}.json"
+        texts = [self.texts("instructions"), self.texts("instruction"), text_beside(self.path, beside)]
+        for text in texts:
+            if found := _first_instruction(text):
+                return found
+        raise self.error(
+            "there is no text in its datasets instructions and instruction, nor in its file ../" + beside,
+            "a text in one of them, or --instruction TEXT ('' for none)",
+        )
+
+    def texts(self, name: str) -> str:
+        """The first text of a dataset; empty if there is none."""
+        if name not in self.file:
+            return ""
+        stored = self.dataset(name)
+        value = stored[()] if stored.ndim == 0 else next(iter(stored[:1].reshape(-1)), b"")
+        if not isinstance(value, (bytes, str)):
+            raise self.error(f"{name} is {stored.dtype} {stored.shape}", "texts")
+        try:
+            return value.decode() if isinstance(value, bytes) else str(value)
+        except UnicodeDecodeError as error:
+            raise self.error(f"{name} holds a text that is not UTF-8", "UTF-8") from error
 
     def error(self, problem: str, expected: str) -> EpisodeError:
         return EpisodeError(f"{self.path}: {problem}; expected {expected}.")
@@ -313,18 +385,16 @@ def text_beside(episode: Path, name: str) -> str:
         raise EpisodeError(f"{path} cannot be read as text ({error}); copy it again, or remove it.") from error
 
 
-def _as_text(value: object) -> str:
-    if isinstance(value, np.ndarray):
-        value = value.reshape(-1)[0] if value.size else ""
-    return value.decode() if isinstance(value, bytes) else str(value)
-
-
 def _first_instruction(text: str) -> str:
-    """The first entry of a JSON list, of RoboTwin's {"seen": […], "unseen": […]}, or plain text."""
+    """The first text of a JSON list, of RoboTwin's {"seen": […], "unseen": […]}, or plain text; empty if there is none."""
     try:
-        content = json.loads(text)
+        content = parse_json(text)
     except (ValueError, RecursionError):
-        return text
+        return text.strip()
     if isinstance(content, dict):
-        content = content.get("seen") or content.get("unseen") or []
-    return str(content[0]) if isinstance(content, Sequence) and not isinstance(content, str) and content else str(content or "")
+        content = [entry for key in INSTRUCTIONS for entry in _as_list(content.get(key))]
+    return next((entry.strip() for entry in _as_list(content) if isinstance(entry, str) and entry.strip()), "")
+
+
+def _as_list(content: Any) -> list[Any]:
+    return content if isinstance(content, list) else [content]

@@ -8,7 +8,8 @@ Writes DIR: meta/ (info, tasks, episodes, statistics), data/ (parquet, many epis
     observation.images.head       the head camera; observation.images.robot with --robot-video: the robot alone by its commands
     next.done, next.success       true at the last frame
 The table of episodes has each episode's robot, task, seed and kind of motion (columns xew/…). A feature that an imported
-episode lacks is omitted for the whole set. `fps` is 50 / 3. Video is lossy; all other data are exact.
+episode lacks is omitted for the whole set. `fps` is the episodes' frame rate, 50 / 3 in simulated data; a set has one rate.
+Video is lossy; all other data are exact.
 
 Command: python -m xew.exchange.lerobot DATA --out DIR [--robots … --tasks … --split train --robot-video]
 """
@@ -29,14 +30,12 @@ import tyro
 from tqdm import tqdm
 
 from xew.config import user_errors
-from xew.dataset import read_dataset
-from xew.episode import HEIGHT, WIDTH, EpisodeError, Record, States, complete_folder, read_states, read_video
+from xew.dataset import demand_one_rate, read_dataset
+from xew.episode import HEIGHT, WIDTH, EpisodeError, Record, States, complete_folder, data_folder, read_pixels, read_states
 from xew.files import hold_lock
 from xew.protocol import expand_robots
 
 VERSION = "v3.0"
-RATE = Fraction(50, 3)
-"""Frames per second."""
 FILES_PER_CHUNK = 1000
 LARGEST_DATA, LARGEST_VIDEO = 100, 200
 """Sizes at which LeRobot's tools begin the next file [MB]; here a video file has one episode."""
@@ -92,7 +91,8 @@ def export(args: Args) -> tuple[int, list[str]]:
     """Write a LeRobotDataset; returns the number of episodes and the omitted features.
 
     Raises:
-        EpisodeError: nothing is selected, the folder exists or cannot be written, or another process writes it.
+        EpisodeError: nothing is selected, the episodes have several frame rates, the folder exists or cannot be written, or
+            another process writes it.
     """
     with hold_lock(args.out):
         if args.out.exists():
@@ -112,11 +112,11 @@ def _select_features(args: Args, chosen: Sequence[tuple[Path, Record]]) -> tuple
     vectors = {
         feature: entry for feature, entry in VECTORS.items() if not any(entry[0] in record.unknown for _, record in chosen)
     }
-    videos = {"observation.images.head": "rgb.mkv"}
+    videos = {"observation.images.head": "rgb"}
     if args.robot_video:
         if without := [folder for folder, record in chosen if "robot" not in record.hashes]:
             raise EpisodeError(f"{without[0]} has no video of the robot alone; omit --robot-video.")
-        videos["observation.images.robot"] = "robot.mkv"
+        videos["observation.images.robot"] = "robot"
     return vectors, videos
 
 
@@ -137,24 +137,21 @@ def _select_episodes(args: Args) -> list[tuple[Path, Record]]:
 def _write(root: Path, chosen: Sequence[tuple[Path, Record]], vectors: Vectors, videos: dict[str, str]) -> None:
     instructions = [record.instruction or record.task for _, record in chosen]
     tasks = {task: index for index, task in enumerate(dict.fromkeys(instructions))}
+    rate = demand_one_rate(data_folder(chosen[0][0]), (record for _, record in chosen))
     episodes: list[dict[str, Any]] = []
     totals = _Totals()
     with _Tables(root / "data") as table:
-        video_files = {key: _VideoFiles(root / "videos" / key) for key in videos}
+        video_files = {key: _VideoFiles(root / "videos" / key, rate) for key in videos}
         start = 0
         for number, (folder, record) in enumerate(tqdm(chosen, desc="exporting", unit="episode")):
-            columns = _columns(read_states(folder), vectors, number, start, tasks[instructions[number]])
+            columns = _columns(read_states(folder, record), vectors, rate, number, start, tasks[instructions[number]])
             place = table.add(columns)
             row: dict[str, Any] = {"episode_index": number, "tasks": [instructions[number]], "length": len(columns["index"])}
             row |= {"data/chunk_index": place.chunk, "data/file_index": place.file}
             row |= {"dataset_from_index": start, "dataset_to_index": start + row["length"]}
             statistics = {name: _statistics(values) for name, values in columns.items()}
             for key, name in videos.items():
-                video = read_video(folder / name)
-                if len(video) != row["length"]:
-                    raise EpisodeError(
-                        f"{folder / name} has {len(video)} frames, its states {row['length']}; generate it again."
-                    )
+                video = read_pixels(folder, name, record=record)
                 row |= video_files[key].add(video)
                 counts = color_counts(video)
                 statistics[key] = _color_statistics(counts, len(video))
@@ -165,10 +162,11 @@ def _write(root: Path, chosen: Sequence[tuple[Path, Record]], vectors: Vectors, 
             row |= {f"stats/{name}/{stat}": value for name, stats in statistics.items() for stat, value in stats.items()}
             episodes.append(row)
             start += row["length"]
-    _write_meta(root, episodes, tasks, totals, _features(vectors, videos), {record.robot for _, record in chosen})
+    robots = {record.robot for _, record in chosen}
+    _write_meta(root, episodes, tasks, totals, _features(vectors, videos, rate), rate, robots)
 
 
-def _columns(states: States, vectors: Vectors, episode: int, start: int, task: int) -> dict[str, np.ndarray]:
+def _columns(states: States, vectors: Vectors, rate: Fraction, episode: int, start: int, task: int) -> dict[str, np.ndarray]:
     """The rows of one episode, by feature: [t n] or [t]."""
     frames = np.arange(states.frame_count)
     last = frames == states.frame_count - 1
@@ -179,7 +177,7 @@ def _columns(states: States, vectors: Vectors, episode: int, start: int, task: i
     return columns | {
         "next.done": last,
         "next.success": last,
-        "timestamp": (frames / float(RATE)).astype(np.float32),
+        "timestamp": (frames / float(rate)).astype(np.float32),
         "frame_index": frames,
         "episode_index": np.full(len(frames), episode),
         "index": start + frames,
@@ -228,20 +226,29 @@ class _Tables:
 class _VideoFiles:
     """H.264 files of one episode each: tools that split or filter the set copy files without encoding."""
 
-    def __init__(self, root: Path) -> None:
-        self.root, self.next = root, Place()
+    def __init__(self, root: Path, rate: Fraction) -> None:
+        self.root, self.rate, self.next = root, rate, Place()
 
     def add(self, video: np.ndarray) -> dict[str, Any]:
-        """Write the video of an episode [t h w 3] uint8 RGB; returns the columns that locate it."""
+        """Write the video of an episode [t h w 3] uint8 RGB; returns the columns that locate it.
+
+        Raises:
+            EpisodeError: its frames have another size than the data set.
+        """
+        if video.shape[1:3] != (HEIGHT, WIDTH):
+            size = f"{video.shape[2]}x{video.shape[1]}"
+            raise EpisodeError(
+                f"an episode has frames of {size}, expected {WIDTH}x{HEIGHT}; exclude it by --robots or --tasks."
+            )
         place, self.next = self.next, self.next.next_place()
         path = place.path(self.root, "mp4")
         path.parent.mkdir(parents=True, exist_ok=True)
         with av.open(str(path), "w") as container:
-            stream = container.add_stream("libx264", rate=RATE, options=ENCODER)
+            stream = container.add_stream("libx264", rate=self.rate, options=ENCODER)
             stream.height, stream.width, stream.pix_fmt = *video.shape[1:3], "yuv420p"
             for number, image in enumerate(video):
                 frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgb24")
-                frame.pts, frame.time_base = number, 1 / RATE
+                frame.pts, frame.time_base = number, 1 / self.rate
                 container.mux(stream.encode(frame))
             container.mux(stream.encode(None))
         key = f"videos/{self.root.name}"
@@ -249,7 +256,7 @@ class _VideoFiles:
             f"{key}/chunk_index": place.chunk,
             f"{key}/file_index": place.file,
             f"{key}/from_timestamp": 0.0,
-            f"{key}/to_timestamp": float(len(video) / RATE),
+            f"{key}/to_timestamp": float(len(video) / self.rate),
         }
 
 
@@ -301,7 +308,7 @@ def _color_statistics(counts: np.ndarray, frames: int) -> dict[str, list[Any]]:
     return {name: numbers.reshape(3, 1, 1).tolist() for name, numbers in statistics.items()} | {"count": [frames]}
 
 
-def _features(vectors: Vectors, videos: Iterable[str]) -> dict[str, dict[str, Any]]:
+def _features(vectors: Vectors, videos: Iterable[str], rate: Fraction) -> dict[str, dict[str, Any]]:
     features: dict[str, dict[str, Any]] = {
         name: {"dtype": "float32", "shape": [len(names)], "names": names} for name, (_, names) in vectors.items()
     }
@@ -312,12 +319,17 @@ def _features(vectors: Vectors, videos: Iterable[str]) -> dict[str, dict[str, An
         "video.codec": "h264",
         "video.pix_fmt": "yuv420p",
         "video.is_depth_map": False,
-        "video.fps": float(RATE),
+        "video.fps": _number(rate),
         "has_audio": False,
     }
     names = ["height", "width", "channels"]
     features |= {key: {"dtype": "video", "shape": [HEIGHT, WIDTH, 3], "names": names, "info": information} for key in videos}
     return features | {name: {"dtype": dtype, "shape": [1], "names": None} for name, dtype in SCALARS.items()}
+
+
+def _number(rate: Fraction) -> int | float:
+    """A whole rate as an integer, which LeRobot's tools expect where they can."""
+    return rate.numerator if rate.denominator == 1 else float(rate)
 
 
 def _write_meta(
@@ -326,6 +338,7 @@ def _write_meta(
     tasks: dict[str, int],
     totals: _Totals,
     features: dict[str, dict[str, Any]],
+    rate: Fraction,
     robots: set[str],
 ) -> None:
     information = {
@@ -337,7 +350,7 @@ def _write_meta(
         "chunks_size": FILES_PER_CHUNK,
         "data_files_size_in_mb": LARGEST_DATA,
         "video_files_size_in_mb": LARGEST_VIDEO,
-        "fps": float(RATE),
+        "fps": _number(rate),
         "splits": {"train": f"0:{len(episodes)}"},
         "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
         "video_path": "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4",
@@ -346,8 +359,8 @@ def _write_meta(
     table = Place().path(root / "meta" / "episodes", "parquet")
     table.parent.mkdir(parents=True)
     parquet.write_table(pa.Table.from_pylist(episodes), table)
-    (root / "meta" / "info.json").write_text(json.dumps(information, indent=4))
-    (root / "meta" / "stats.json").write_text(json.dumps(totals.statistics(), indent=4))
+    (root / "meta" / "info.json").write_text(json.dumps(information, indent=4), encoding="utf-8")
+    (root / "meta" / "stats.json").write_text(json.dumps(totals.statistics(), indent=4), encoding="utf-8")
     index = pd.Index(list(tasks), name="task")
     pd.DataFrame({"task_index": list(tasks.values())}, index=index).to_parquet(root / "meta" / "tasks.parquet")
 

@@ -1,16 +1,18 @@
 """Import RoboTwin 2.0 episodes from HDF5 files of the legacy layout or of version 1.0.
 
-Reads  SRC: a file, or a folder with episode*.hdf5 at any depth
+Reads  SRC: a file, or a folder with <task>/<robot>/data/episodeN.hdf5 at any depth
 Writes <out>/<task>/<seed>/<robot>/, see xew/episode.py, and <out>/robots/<robot>/
 
 RoboTwin's joint positions are drive targets and become `action`, the command in force at each frame. Measured joints, objects,
 contacts and the robot's mask stay unknown (`Record.unknown`). End poses are measured and become tool poses. If the joints of
 one of xew's robots reach the end poses, that robot is stored with the fitted bases, and the robot-only video and keypoints are
-rendered with it, posed by the commands. Otherwise there are none.
+rendered with it, posed by the commands. Otherwise there are none. What neither the file nor its folders say is asked for by an
+option.
 
 Command: python -m xew.exchange.robotwin SRC --out data [--robot arx_x5 --task NAME]
 """
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,8 +24,19 @@ from tqdm import tqdm
 
 import xew
 from xew.config import ConfigError, user_errors
-from xew.episode import EpisodeError, Record, States, episode_folder, read_record, read_states, write_episode
-from xew.exchange.hdf5 import Recorded, read_robotwin, text_beside
+from xew.episode import (
+    EpisodeError,
+    Record,
+    States,
+    array_hash,
+    episode_folder,
+    exact_rate,
+    read_record,
+    read_states,
+    write_episode,
+)
+from xew.exchange.hdf5 import ReadOptions, Recorded, read_robotwin, text_beside
+from xew.exchange.pictures import Colors
 from xew.files import hold_lock
 from xew.names import check_name
 from xew.protocol import ACTION_DIM, FRAME_RATE, OWN_MOTION
@@ -45,6 +58,10 @@ EMBODIMENTS = {
     "piper": "piper",
 }
 """RoboTwin's names of robots, and xew's."""
+ROBOT_NAMES = "|".join(EMBODIMENTS).replace("-", "[-_]")
+ROBOT_FOLDER = re.compile(rf"({ROBOT_NAMES})(_(demo_)?(clean|randomized)(_[0-9]+)?)?", re.IGNORECASE)
+"""Name of the folder above data/ that names a robot, such as ARX-X5_clean_50 or arx_x5."""
+EPISODE_NAME = re.compile(r"episode_?([0-9]+)\.hdf5")
 TOOL_DISTANCE = {"aloha_agilex": 0.12, "arx_x5": 0.12, "ur5_wsg": 0.11, "franka_panda": 0.08, "piper": 0.12}
 """Distance from the link that carries the tool to RoboTwin's tool center point [m] (gripper_bias of its embodiments)."""
 FIT_POSITION, FIT_ROTATION = 0.01, 0.05
@@ -63,39 +80,40 @@ class Args:
     """Path of a RoboTwin episode (.hdf5), or of a folder with them at any depth."""
     out: Path = Path("data")
     robot: str | None = None
-    """Registry key, module:NAME or path of a robot; default: by the names of the folders."""
+    """Registry key, module:NAME or path of a robot; default: by the folder above data/, such as ARX-X5_clean_50."""
     task: str | None = None
-    """Name of the task; default: the name of the third folder above the file, as in RoboTwin's layout."""
+    """Name of the task; default: the folder above the robot's, as in <task>/<robot>/data/episode0.hdf5."""
+    instruction: str | None = None
+    """Instruction of all episodes, perhaps empty; default: the first that RoboTwin stored for each."""
+    frame_rate: float | None = None
+    """Frames per second; default: by the file's frequency, or RoboTwin's 16.67 in files without it."""
+    colors: Colors = "marked"
+    """marked: RoboTwin's pictures. ordinary: a viewer shows their true colors. swapped: a viewer shows red as blue."""
 
 
 def find_episodes(source: Path) -> list[Path]:
     """All RoboTwin episodes at or below a path. Raises EpisodeError if there is none."""
     paths = [source] if source.is_file() else sorted(source.rglob("episode*.hdf5"))
     if not paths:
-        raise EpisodeError(f"no episode*.hdf5 at {source}; pass a RoboTwin episode or a folder of them.")
+        others = sorted(path.name for path in source.rglob("*.h*5"))[:3]
+        there = f"; there are {', '.join(others)}" if others else ""
+        raise EpisodeError(f"no episode*.hdf5 at {source}{there}; pass a RoboTwin episode or a folder of them.")
     return paths
 
 
 def import_episode(path: Path, args: Args) -> Record:
-    """Read one file and write one episode; an existing episode is skipped.
-
-    RoboTwin counts the seeds of each configuration from 0: files of two configurations may have the same task, seed and robot.
+    """Read one file and write one episode; an existing episode is skipped if it holds the same.
 
     Raises:
         EpisodeError, ConfigError: the file or the robot cannot be used, or another recording has its task, seed and robot.
     """
-    recorded = read_robotwin(path)
+    recorded = read_robotwin(path, ReadOptions(args.frame_rate, args.colors, args.instruction))
     name, robot = _robot(path, recorded, args)
-    task, seed = check_name(args.task or _task(path), f"task of {path}"), _seed(path)
+    task, seed = check_name(args.task or _folders(path, "task")[0], f"task of {path}"), _seed(path)
     action = canonical_commands(recorded.arms, recorded.grippers).astype(np.float32)
     folder = episode_folder(args.out, task, seed, name)
     if (folder / "episode.json").is_file():
-        if not np.array_equal(read_states(folder).action, action):
-            raise EpisodeError(
-                f"{path}: {folder} holds another recording of that task, seed and robot; import this one as another --task or "
-                "into another --out."
-            )
-        return read_record(folder)
+        return _check_existing(path, folder, recorded, action)
     for neighbor in folder.parent.glob("[!.]*/episode.json"):
         if not read_record(neighbor.parent).source:
             raise EpisodeError(
@@ -118,6 +136,29 @@ def import_episode(path: Path, args: Args) -> Record:
         unknown=UNKNOWN if recorded.tool_pose is not None else (*UNKNOWN, "tool_pose"),
     )
     return read_record(write_episode(args.out, record, states, recorded.rgb, video))
+
+
+def _check_existing(path: Path, folder: Path, recorded: Recorded, action: np.ndarray) -> Record:
+    """The header of an episode that was imported before. Raises EpisodeError if it holds another recording or reading.
+
+    RoboTwin counts the seeds of each configuration from 0: files of two configurations may have the same task, seed and robot.
+    """
+    record = read_record(folder)
+    if not np.array_equal(read_states(folder).action, action):
+        raise EpisodeError(
+            f"{path}: {folder} holds another recording of that task, seed and robot; import this one as another --task or into "
+            "another --out."
+        )
+    same = {
+        "frame rate": record.frame_rate == recorded.frame_rate,
+        "instruction": record.instruction == recorded.instruction,
+        "picture": record.hashes["rgb"] == array_hash(recorded.rgb),
+    }
+    if others := [name for name, is_same in same.items() if not is_same]:
+        raise EpisodeError(
+            f"{path}: {folder} holds this recording with another {' and '.join(others)}; delete it, or choose another --out."
+        )
+    return record
 
 
 def fit_bases(robot: RobotSpec, recorded: Recorded) -> RobotSpec | None:
@@ -162,6 +203,10 @@ def _robot(path: Path, recorded: Recorded, args: Args) -> tuple[str, RobotSpec |
     robot = get_robot(named, args.out)
     if is_path(named) and (tool := read_draft(find_description(Path(named))).arms[0].tool_pose):
         robot = replace(robot, arms=(replace(robot.arms[0], tool_pose=tool), replace(robot.arms[1], tool_pose=tool)))
+    if (joints := recorded.arms.shape[2]) != robot.arm_joint_count:
+        raise EpisodeError(
+            f"{path} has arms of {joints} joints, {robot.title} has {robot.arm_joint_count}; pass another --robot."
+        )
     key, placed = f"{robot.key}_robotwin", fit_bases(robot, recorded)
     if placed is None:
         return key, None
@@ -177,30 +222,42 @@ def _robot(path: Path, recorded: Recorded, args: Args) -> tuple[str, RobotSpec |
 
 
 def _embodiment(path: Path) -> str:
-    """The key of the robot that a folder above the file is named after."""
-    for part in reversed(path.absolute().parts[:-1]):
-        for theirs, ours in EMBODIMENTS.items():
-            if theirs.lower().replace("-", "_") in part.lower().replace("-", "_"):
-                return ours
-    raise ConfigError(f"{path}: no folder above it is named after a robot ({', '.join(EMBODIMENTS)}); pass --robot.")
+    """The key of the robot after which the folder above data/ is named."""
+    _, folder = _folders(path, "robot")
+    if match := ROBOT_FOLDER.fullmatch(folder):
+        return next(ours for theirs, ours in EMBODIMENTS.items() if _plain(theirs) == _plain(match[1]))
+    raise ConfigError(
+        f"{path}: its folder {folder!r} names no robot; expected {', '.join(EMBODIMENTS)}, perhaps with an ending such as "
+        "_clean_50; pass --robot."
+    )
 
 
-def _task(path: Path) -> str:
-    """data/<task>/<config>/data/episode0.hdf5, and data/<config>/<task>/<robot>/data/episode_0000000.hdf5."""
+def _plain(name: str) -> str:
+    return name.lower().replace("-", "_")
+
+
+def _folders(path: Path, needed: str) -> tuple[str, str]:
+    """Task and folder of the robot in <task>/<robot>/data/episode0.hdf5, perhaps below a folder of the configuration."""
     parts = path.absolute().parts
     if len(parts) < 4 or parts[-2] != "data":
-        raise ConfigError(f"{path} does not follow RoboTwin's layout (<task>/…/data/episode*.hdf5); pass --task.")
-    return parts[-4]
+        raise ConfigError(f"{path} is not at <task>/<robot>/data/episodeN.hdf5, RoboTwin's layout; pass --{needed}.")
+    return parts[-4], parts[-3]
 
 
 def _seed(path: Path) -> int:
     """The scene's seed by RoboTwin's seed.txt, or the episode's number without that file."""
-    digits = "".join(filter(str.isdecimal, path.stem))
-    if not digits:
-        raise EpisodeError(f"{path}: the file's name has no number; expected a name such as episode0.hdf5.")
-    seeds = text_beside(path, "seed.txt").split()
-    number = int(digits)
-    return int(seeds[number]) if number < len(seeds) and seeds[number].isdecimal() and len(seeds[number]) < 20 else number
+    match = EPISODE_NAME.fullmatch(path.name)
+    if not match:
+        raise EpisodeError(f"{path}: the file's name gives no seed; rename it to episodeN.hdf5 or episode_N.hdf5.")
+    number, seeds = int(match[1]), text_beside(path, "seed.txt").split()
+    if not seeds:
+        return number
+    if number < len(seeds) and re.fullmatch("[0-9]{1,19}", seeds[number]):
+        return int(seeds[number])
+    raise EpisodeError(
+        f"{path.absolute().parents[1] / 'seed.txt'} has {len(seeds)} entries and no seed of {path.name}; correct it, or remove "
+        "it to take the files' numbers as seeds."
+    )
 
 
 def _build_states(
@@ -253,6 +310,8 @@ def main() -> None:
     args = tyro.cli(Args, description=__doc__)
     if args.robot:
         get_robot(args.robot, args.out)  # a mistake is reported once, not for every file
+    if args.frame_rate is not None:
+        exact_rate(args.frame_rate)
     with hold_lock(args.out):
         records, problems = import_all(find_episodes(args.source), args)
     rendered = sum("robot" in record.hashes for record in records)
@@ -260,9 +319,12 @@ def main() -> None:
     rates = sorted({1000 / record.frame_rate for record in records})
     if any(abs(1000 / FRAME_RATE - time) > 0.1 for time in rates):
         times = " and ".join(f"{time:.0f}" for time in rates)
-        print(f"their frames are {times} ms apart, in simulated data {1000 / FRAME_RATE:.0f} ms: do not mix them in training")
+        print(
+            f"their frames are {times} ms apart, in simulated data {1000 / FRAME_RATE:.0f} ms: training refuses to mix them. "
+            "If another rate is right, delete them and pass --frame-rate."
+        )
     if problems:
-        raise EpisodeError("\n".join([*problems, f"{len(problems)} files were not imported."]))
+        raise EpisodeError(f"{len(problems)} of {len(records) + len(problems)} files were not imported:", *problems)
 
 
 if __name__ == "__main__":

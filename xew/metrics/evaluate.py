@@ -57,7 +57,7 @@ def grade_tables(args: Args) -> None:
     print(write_scores(settings, listing))
     if errors:
         total = len(listing.jobs) + len(listing.errors)
-        raise EpisodeError(f"{len(errors)} of {total} could not be graded:\n  " + "\n  ".join(errors))
+        raise EpisodeError(f"{len(errors)} of {total} could not be graded:", *(f"  {error}" for error in errors))
 
 
 def check(args: Args, path: Path) -> None:

@@ -225,19 +225,22 @@ def _remedy_of_shape(shape: tuple[int, ...]) -> str:
 
 
 def _check_range(name: str, video: Any) -> None:
-    """Raise ValueError if the first frame of a floating video [t h w 3] is clearly not in [0, 1].
+    """Raise ValueError if frames of a floating video [t h w 3] are clearly not in [0, 1].
 
-    Only the first frame, because a whole video would take longer than its PSNR. OVERSHOOT is admitted.
+    Only the first, middle and last one, because a whole video would take longer than its PSNR. OVERSHOOT is admitted.
     """
     if isinstance(video, jax.core.Tracer) or jnp.result_type(video) == jnp.uint8:
         return
     if isinstance(video, jax.Array) and not video.is_fully_addressable:
         return
-    frame = np.asarray(video[0], np.float32)
-    low, high = float(frame.min()), float(frame.max())
-    if low < -OVERSHOOT or high > 1 + OVERSHOOT:
-        remedy = "divide by 255" if high > 2 else f"of [-1, 1] take ({name} + 1) / 2"
-        raise ValueError(f"the first frame of {name} goes from {low:.3g} to {high:.3g}, expected floats in [0, 1]; {remedy}.")
+    places = {"first": 0, "middle": len(video) // 2, "last": len(video) - 1}
+    for place, frame in zip(places, np.asarray(video[np.array([*places.values()])], np.float32), strict=True):
+        low, high = float(np.fmin.reduce(frame, axis=None)), float(np.fmax.reduce(frame, axis=None))  # which skip NaN
+        if low < -OVERSHOOT or high > 1 + OVERSHOOT:
+            remedy = "divide by 255" if high > 2 else f"of [-1, 1] take ({name} + 1) / 2"
+            raise ValueError(
+                f"the {place} frame of {name} goes from {low:.3g} to {high:.3g}, expected floats in [0, 1]; {remedy}."
+            )
 
 
 def check_arrays(**arrays: Any) -> None:

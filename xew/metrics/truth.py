@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from xew.episode import EpisodeError, demand_known, project, read_states, read_video
+from xew.episode import EpisodeError, Record, demand_known, project, read_pixels, read_record, read_states
 from xew.metrics.estimators.appearance import REST as SCENE
 
 NEEDS = {
@@ -104,7 +104,9 @@ class Truth:
         return np.linalg.norm(np.where(inside.any(axis=1), high - low, 0), axis=-1).astype(np.float32)
 
 
-def read_truth(folder: Path, frames: int, compared: Collection[str], cache: Path | None = None) -> Truth:
+def read_truth(
+    folder: Path, frames: int, compared: Collection[str], cache: Path | None = None, record: Record | None = None
+) -> Truth:
     """The first frames of an episode.
 
     Args:
@@ -112,13 +114,15 @@ def read_truth(folder: Path, frames: int, compared: Collection[str], cache: Path
         frames: how many are asked for.
         compared: keys of NEEDS; an array that none of them rests on may be unknown.
         cache: folder of points on surfaces, which are rendered once and kept there; None renders them again.
+        record: the episode's header, which is read if None.
 
     Raises:
         EpisodeError: a file is missing or damaged, files contradict each other, or the episode does not know what is compared.
     """
-    demand_known(folder, *sorted({name for kind in compared for name in NEEDS[kind]}))
-    states = read_states(folder)
-    rgb = read_video(folder / "rgb.mkv")
+    record = record or read_record(folder)
+    demand_known(folder, *sorted({name for kind in compared for name in NEEDS[kind]}), record=record)
+    states = read_states(folder, record)
+    rgb = read_pixels(folder, "rgb", record=record)
     if rgb.shape[:3] != states.robot_mask.shape:
         raise EpisodeError(f"{folder}: video {rgb.shape[:3]} and masks {states.robot_mask.shape} differ; generate it again.")
     objects = project(states.object_pose[..., :3], states.intrinsics, states.extrinsics)[0].astype(np.float32)

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Shaped, UInt8
 from scipy.spatial.transform import Rotation
 
-from xew.episode import Record, States, data_folder, read_video
+from xew.episode import Record, States, data_folder, read_pixels
 from xew.model.video.frames import TEMPORAL_FACTOR
 from xew.protocol import ARMS
 
@@ -57,7 +57,7 @@ class Command:
     @cached_property
     def render(self) -> Video:
         """The robot-only video [t h w 3] uint8."""
-        return read_video(self.render_path) if self.rendered is None else self.rendered
+        return read_pixels(self.render_path.parent, self.render_path.stem) if self.rendered is None else self.rendered
 
     @cached_property
     def streams(self) -> "xew.sim_warp.rendering.streams.CommandStreams":
@@ -171,7 +171,7 @@ def make_command(
 ) -> Command:
     """The command of an episode; videos [t h w 3] as in `episodes.commands.episode_command`."""
     render, data = folder / "robot.mkv", data_folder(folder)
-    first = partial(read_video, folder / "rgb.mkv", most=1) if scene is None else partial(np.copy, scene[:1])
+    first = partial(read_pixels, folder, "rgb", most=1, record=record) if scene is None else partial(np.copy, scene[:1])
     return Command(record.robot, states.action, states.intrinsics, states.extrinsics, render, rendered, data, first)
 
 

@@ -104,7 +104,7 @@ class Experiment:
     def choice(self) -> EpisodeChoice:
         """Selection of episodes. Raises ConfigError if the replayed run no longer exists."""
         adapt, targets, replay = self.adapt, expand_robots(self.adapt.robots), tuple[str, ...]()
-        samples = sample_roles(self.robots, targets) if self.train.sample_every else {}
+        samples = sample_roles(self.robots, targets) if self.train.samples else {}
         if adapt.start_from is None:
             return EpisodeChoice(self.robots.train_robots, samples=samples, motion=self.robots.motion)
         if adapt.replay:
@@ -154,7 +154,7 @@ def load_recorded(path: Path) -> Experiment:
         ConfigError: as `load_experiment`.
     """
     experiment = load(Experiment, path)
-    if experiment.codec.weights is not None and any((path.parent / RUN_CODEC).glob("*")):  # the weights may have moved
+    if experiment.codec.weights is not None and any((path.parent / RUN_CODEC).glob("[!.]*")):  # the weights may have moved
         experiment = replace(experiment, codec=replace(experiment.codec, weights=path.parent / RUN_CODEC))
     demand_admitted(experiment, str(path))
     check_experiment(experiment, str(path))

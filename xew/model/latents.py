@@ -74,6 +74,8 @@ def encode_experiment(experiment: Experiment, source: PixelSource = stored_pixel
     """
     check_lpips()
     encoding, choice, dataset = experiment.encoding, experiment.choice, read_dataset(experiment.data)
+    if experiment.cache is None and encoding.folder.is_symlink():
+        raise ConfigError(f"{encoding.folder} is a link; name the folder that it leads to: --cache {encoding.folder.resolve()}")
     episodes = training_episodes(dataset, choice)
     codec = load_codec(encoding)
     with hold_lock(encoding.folder, wait=True):
@@ -91,7 +93,7 @@ def encode_experiment(experiment: Experiment, source: PixelSource = stored_pixel
             ceiling = measured.result() if measured else measure()
         header = {"version": CACHE_VERSION, "codec": codec.decoder_hash, "clip": asdict(experiment.clip)}
         header |= {"streams": list(cache.streams), "episodes": len(episodes), "ceiling": ceiling}
-        write_text(encoding.folder / "header.json", json.dumps(header, indent=1) + "\n")
+        write_text(encoding.folder / "header.json", json.dumps(header, indent=1) + "\n", within=encoding.folder)
     robots, streams = sorted({record.robot for _, record in episodes}), ", ".join(cache.streams)
     named = ", ".join(robots) if len(robots) <= MOST_NAMED else f"{len(robots)} robots"
     print(f"{encoding.folder}: {len(episodes)} episodes of {named}")

@@ -9,7 +9,6 @@ tree of their videos (`xew.rollout`). Existing rollouts are kept: if the model h
 Command: python -m xew.model.outside module:NAME --data DATA --split test --out rollouts/NAME
 """
 
-import importlib
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,9 +19,9 @@ import numpy as np
 import tyro
 from tqdm import tqdm
 
-from xew.config import ConfigError, admit, user_errors
+from xew.config import ConfigError, admit, import_named, user_errors
 from xew.dataset import Episode
-from xew.episode import read_video, remove_left_overs
+from xew.episode import read_pixels, remove_left_overs
 from xew.files import hold_lock
 from xew.model.episodes.choice import select_episodes
 from xew.model.episodes.commands import episode_command
@@ -92,9 +91,8 @@ class OutsideModel(Protocol):
 
 def load_model(name: str) -> OutsideModel:
     """The model `module:NAME`; a class is instantiated. Raises ConfigError if there is none."""
-    module, _, attribute = name.partition(":")
     try:
-        imported = getattr(importlib.import_module(module), attribute)
+        imported = import_named(name)
     except (ImportError, AttributeError, ValueError) as error:
         raise ConfigError(
             f"cannot import the model {name!r}: {error}; expected module:NAME, as examples.own_model:freeze."
@@ -118,7 +116,7 @@ def read_inputs(episode: Episode, max_frames: int = 0, streams: bool = False) ->
         record.instruction,
         record.frame_rate,
         frames,
-        first_frame=np.array(read_video(folder / "rgb.mkv", most=1)[0]),
+        first_frame=np.array(read_pixels(folder, "rgb", most=1, record=record)[0]),
         joints=np.array(command.action[:frames]),
         tool_poses=np.array(command.tools[:frames]),
         intrinsics=np.array(command.intrinsics),
@@ -147,7 +145,7 @@ class Args:
     """A function or class, such as examples.own_model:freeze."""
     data: Path
     """Episodes."""
-    split: Literal["test", "validation", "train"] = "test"
+    split: Literal["test", "validation", "train", "final"] = "test"
     """Seed family; use validation seeds for tuning."""
     robots: tuple[str, ...] = ()
     """Robots to predict (default: all in the data)."""

@@ -63,7 +63,7 @@ def release(run: Path, out: Path, data: Path | None = None, scores: Path | None 
     with write_checkpoints(out) as checkpoints:
         save_params(checkpoints, step, jax.tree.map(lambda leaf: leaf.astype(jnp.bfloat16), params))
     size = sum(leaf.size for leaf in jax.tree.leaves(params))
-    write_text(out / CARD, write_card(experiment, step, size, data_counts, summary))
+    write_text(out / CARD, write_card(experiment, step, size, data_counts, summary), within=out)
     return step
 
 

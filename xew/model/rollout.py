@@ -171,7 +171,7 @@ class RolloutWriter:
 
     def _write(self, record: Record, video: np.ndarray, header: dict[str, Any]) -> Path:
         resized = video if self.resize is None else self.resize(video)
-        return write_rollout(self.out, record.task, record.seed, record.robot, resized, header)
+        return write_rollout(self.out, record.task, record.seed, record.robot, resized, header, record.frame_rate)
 
     def _settle(self) -> None:
         self.waiting.popleft().result()
@@ -215,7 +215,7 @@ class Flags:
     """Step of the run's checkpoint (default: the latest)."""
     data: Path | None = None
     """Data set (default: the run's)."""
-    split: Literal["test", "validation", "train"] = "test"
+    split: Literal["test", "validation", "train", "final"] = "test"
     """Seed family; use validation seeds for tuning."""
     robots: tuple[str, ...] = ()
     """Robots to predict (default: all in the data)."""

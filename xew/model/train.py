@@ -17,7 +17,7 @@ import numpy as np
 from jax.sharding import AbstractMesh
 
 from xew.compilation import keep_compiled_programs
-from xew.config import ConfigError, user_errors
+from xew.config import CONVERTER, ConfigError, user_errors
 from xew.dataset import read_dataset
 from xew.files import hold_lock
 from xew.model.devices.sharding import (
@@ -39,7 +39,7 @@ from xew.model.training.flops import flops_of_step
 from xew.model.training.loop import STOPPED, Meter, Timetable, run_steps
 from xew.model.training.memory import check_memory, estimate_memory
 from xew.model.training.order import make_dataset
-from xew.model.training.samples import log_samples
+from xew.model.training.samples import SampleRollouts, sample_steps
 from xew.model.training.start import begin_state
 from xew.model.training.step import StepResult, make_trainer
 
@@ -114,16 +114,19 @@ def train(experiment: Experiment, *, resume: bool = False, overwrite: bool = Fal
     trainer = make_trainer(spec, mesh, codec)
     check_memory(estimate_memory(trainer, experiment.encoding), ignore=ignore_memory)
 
-    source.scales = begin_run(experiment, codec, source.scales, resume=resume, overwrite=overwrite)
+    trained = (*episodes.fresh, *episodes.replay)
+    source.scales = begin_run(experiment, codec, source.scales, trained, resume=resume, overwrite=overwrite)
     timetable = Timetable(
-        settings.steps, settings.log_every, settings.save_every, settings.sample_every, learning_rate(settings)
+        settings.steps, settings.log_every, settings.save_every, sample_steps(settings), learning_rate(settings)
     )
-    with open_session(experiment.out, settings.keep_checkpoints) as session:
+    recommended = CONVERTER.unstructure(Experiment(experiment.data, experiment.out))
+    with open_session(experiment.out, settings.keep_checkpoints, recommended) as session:
         state = begin_state(trainer, experiment.adapt.start_from, experiment.model.weights, session, batches)
 
+        samples = SampleRollouts(experiment, codec, source.scales, episodes.samples)
+
         def draw_samples(state: TrainState, step: int) -> None:
-            params = trainer.average_params(state)
-            log_samples(session.log, experiment, codec, params, source.scales, episodes.samples, step)
+            samples.log(session.log, trainer.average_params(state), step)
 
         meter = Meter(summarize, settings.batch, flops_of_step(spec))
         state = run_steps(timetable, session, meter, trainer.step, state, batches, draw_samples, trainer.place)
@@ -134,7 +137,7 @@ def summarize(results: Sequence[StepResult]) -> dict[str, float]:
     """Mean loss, loss by noise level and gradient norm over some steps."""
     losses, sigma, weights = (np.concatenate([getattr(r, name) for r in results]) for name in ("losses", "sigma", "weights"))
     norms = [float(result.gradient_norm) for result in results]
-    values = {"train/loss": (weights * losses).sum(axis=1).mean(), "train/gradient_norm": np.mean(norms)}
+    values = {"loss/train": (weights * losses).sum(axis=1).mean(), "train/gradient_norm": np.mean(norms)}
     for low, high in itertools.pairwise(NOISE_LEVEL_EDGES):
         inside = (sigma > low) & (sigma <= high) & (weights > 0)
         if inside.any():

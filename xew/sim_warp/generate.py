@@ -10,6 +10,7 @@ Command: python -m xew.sim_warp.generate --batch 256 [--tasks … --robots … -
     --validation-seeds 4 --motion shared --out data]
 """
 
+import tempfile
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -22,7 +23,7 @@ from tqdm import tqdm
 
 from xew.config import user_errors
 from xew.dataset import find_records
-from xew.episode import EpisodeError, Record, episode_folder, remove_left_overs
+from xew.episode import EpisodeError, Record, remove_left_overs
 from xew.files import hold_lock
 from xew.protocol import SEED_STARTS, TEST_SEEDS_PER_TASK, TRAIN_SEEDS_PER_TASK, expand_robots, seed_split
 from xew.sim_warp.devices.workers import Workers, find_device, find_devices, quiet_warp, worker_count
@@ -53,6 +54,8 @@ class Args:
     """Number of accepted test seeds per task; they never overlap with training seeds."""
     validation_seeds: int = 0
     """Number of accepted validation seeds per task: for samples during training, calibration and tuning."""
+    final_seeds: int = 0
+    """Number of accepted seeds per task of the block reserved for the final study."""
     test_robots: tuple[str, ...] = ()
     """Robots of the test seeds; default: --robots."""
     out: Path = Path("data")
@@ -119,7 +122,12 @@ def generate(args: Args) -> list[Family]:
 
 def plan_seeds(args: Args, robots: Mapping[str, Sequence[str]], manifest: Manifest) -> list[Family]:
     """The requested families of seeds; arguments as of `plan_families`."""
-    wanted = {"train": args.train_seeds, "validation": args.validation_seeds, "test": args.test_seeds}
+    wanted = {
+        "train": args.train_seeds,
+        "validation": args.validation_seeds,
+        "test": args.test_seeds,
+        "final": args.final_seeds,
+    }
     return plan_families(args.tasks, wanted, robots, manifest, motion=args.motion, unpaired=args.unpaired)
 
 
@@ -159,8 +167,7 @@ def _prepare_folder(out: Path) -> None:
     try:
         out.mkdir(parents=True, exist_ok=True)
         remove_left_overs(out)
-        (out / ".writable").touch()
-        (out / ".writable").unlink()
+        tempfile.TemporaryFile(dir=out).close()  # whether it can be written
     except OSError as error:
         raise EpisodeError(f"cannot write to {out}: {error.strerror}. Choose another folder with --out.") from error
 
@@ -188,8 +195,6 @@ def _read_existing(families: list[Family], args: Args) -> None:
                 continue
             same_family = seed_split(record.seed) == seed_split(family.first_seed)
             if record.task == family.task and same_family:
-                if folder != episode_folder(out, record.task, record.seed, record.robot):
-                    raise EpisodeError(f"{folder} holds {record.task}/{record.seed}/{record.robot}; move or delete it.")
                 if record.source:
                     raise EpisodeError(
                         f"{folder} was imported ({record.source}): its seed is not the scene of {record.task} here. "

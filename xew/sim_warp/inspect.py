@@ -19,6 +19,7 @@ from xew.config import admit, user_errors
 from xew.dataset import explain_missing, read_dataset
 from xew.episode import EpisodeError, Record
 from xew.files import hold_lock
+from xew.names import plain_line
 from xew.sim_warp.devices.workers import quiet_warp
 from xew.sim_warp.inspection.checks import render_videos, rerender, verify
 from xew.sim_warp.inspection.explorer import Page, choose_scenes, find_predictions, write_page
@@ -71,12 +72,12 @@ def main() -> None:
     print(yield_table([record for _, record in cells]))
     for folder, record in cells:
         if not record.success:
-            print(f"{folder}: {record.failure}: {record.failure_detail}")
+            print(plain_line(f"{folder}: {record.failure}: {record.failure_detail}"))
     pictured = [(folder, record) for folder, record in cells if record.hashes]
     if args.verify:
         damaged += verify([folder for folder, _ in pictured])
     if damaged:
-        raise EpisodeError("\n".join([*damaged, f"{len(damaged)} damaged."]))
+        raise EpisodeError(f"{len(damaged)} damaged:", *damaged)  # the number first: of a long list the end is cut off
     if not pictured and (args.visibility or args.rerender or args.render or args.pictures or args.grid or args.page):
         raise EpisodeError(f"no seed under {args.data} is accepted; expected at least one to render or draw.")
     if args.visibility:

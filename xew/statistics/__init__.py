@@ -3,7 +3,9 @@
 `evaluate`, `report`, `study` and `distance` all ask here, so the same scores have the same intervals and verdicts in each.
 The package stands on the ground: it imports NumPy, SciPy and pandas, and nothing of ours but `xew.protocol`.
 
-    bootstrap.py   what is drawn (trainings, then scenes within tasks), how often, and the mean in every draw
+    bootstrap.py   draws of scenes within tasks, and the mean of scores in every draw
+    runs.py        draws of training runs, and the spread between runs that a single run carries
+    means.py       means over scenes and runs, and numbers computed of them
     inference.py   intervals and p-values of what was drawn, Holm's correction for several tests
     verdicts.py    noise floors, and better, worse or unresolved
     suites.py      which of two suites' metrics decides, and where they part
@@ -11,18 +13,11 @@ The package stands on the ground: it imports NumPy, SciPy and pandas, and nothin
     summary.py     means of a table by group of robots, and differences between its models
 """
 
-from xew.statistics.bootstrap import (
-    DRAWS,
-    MIN_SCENES,
-    Mean,
-    bootstrap_means,
-    combine,
-    every_draw,
-    find_strata,
-    pool_trainings,
-)
-from xew.statistics.inference import LEVEL, SIGNIFICANCE, Drawn, holm
+from xew.statistics.bootstrap import bootstrap_means, every_draw, find_strata
+from xew.statistics.inference import DRAWS, LEVEL, SIGNIFICANCE, Component, Drawn, holm
+from xew.statistics.means import MIN_SCENES, Mean, Part, combine, fixed_mean, pool_runs
 from xew.statistics.power import describe_power, find_power
+from xew.statistics.runs import ASSUMED_SPREAD, RunSpread, find_spread
 from xew.statistics.suites import describe_parting, find_parting, strict_metrics
 from xew.statistics.summary import Summary, measure_power, summarize
 from xew.statistics.verdicts import (
@@ -37,6 +32,7 @@ from xew.statistics.verdicts import (
 )
 
 __all__ = [
+    "ASSUMED_SPREAD",
     "BETTER",
     "DRAWS",
     "LEVEL",
@@ -44,8 +40,11 @@ __all__ = [
     "SIGNIFICANCE",
     "UNRESOLVED",
     "WORSE",
+    "Component",
     "Drawn",
     "Mean",
+    "Part",
+    "RunSpread",
     "Summary",
     "bootstrap_means",
     "combine",
@@ -55,13 +54,15 @@ __all__ = [
     "every_draw",
     "find_parting",
     "find_power",
+    "find_spread",
     "find_strata",
+    "fixed_mean",
     "floor_sources",
     "holm",
     "largest_floor",
     "measure_power",
     "noise_floor",
-    "pool_trainings",
+    "pool_runs",
     "strict_metrics",
     "summarize",
     "verdict",

@@ -9,93 +9,19 @@ Of n units of a stratum (a task), n - 1 are drawn and count n / (n - 1) each, so
 no bias however few they are (Rao and Wu 1988, "Resampling inference with complex survey data").
 """
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from collections.abc import Iterator, Sequence
+from functools import lru_cache
 from itertools import product
 
 import numpy as np
 import pandas as pd
 
-from xew.statistics.inference import LEVEL, Drawn
+from xew.statistics.inference import DRAWS, SEED
+from xew.statistics.means import Mean, fixed_mean
 
-DRAWS = 9999
-"""Number of bootstrap draws. SciPy's default: by chance, an end of an interval is off by 3 % of the mean's standard error."""
-MIN_SCENES = 6
-"""Least number of scenes (or of tasks, where tasks are drawn) that have an interval and a verdict.
-
-With six, all differences have one sign by chance in 3 % of cases, with five in 6 %.
-"""
-SEED = 0
-"""Seed of all draws: two tables with as many scenes of each task see the same draws."""
 UNITS = {"scene": ("task", "seed"), "task": ("task",)}
 COLUMNS_AT_ONCE = 128
 """Number of means that are drawn together, which bounds the memory."""
-
-
-@dataclass(frozen=True)
-class Mean:
-    """A mean over episodes, or a number computed of several means, with its value in every bootstrap draw."""
-
-    values: np.ndarray
-    """[1 + n + k] float64: the number itself, its value in each of n draws (NaN in a draw without any episode), and its value
-    without each of the k trainings that `left_out` counts."""
-    count: int
-    """Number of episodes; 0 where it is not known (printed means)."""
-    scenes: int | None
-    """Number of scenes or tasks that these episodes are of; None where the values are not drawn over any (printed means)."""
-    freedom: float = np.inf
-    """Degrees of freedom of the scenes: scenes less tasks."""
-    trainings: int = 0
-    """Least number of trainings that the number rests on: 1 where the interval is of this training; 0 where none is known."""
-    left_out: tuple[int, ...] = ()
-    """Numbers of trainings of the variants that have several, in the order of the last values."""
-
-    @property
-    def value(self) -> float:
-        return float(self.values[0])
-
-    def interval(self, level: float = LEVEL) -> tuple[float, float]:
-        """Ends of the interval; NaN where there are fewer than MIN_SCENES scenes."""
-        if self.scenes is not None and self.scenes < MIN_SCENES:
-            return np.nan, np.nan
-        return self._drawn.interval(level)
-
-    def p_above(self, bound: float, level: float = LEVEL) -> float:
-        """One-sided p of the number being above a bound, see `Drawn.p_above`; 1 where there are fewer than MIN_SCENES scenes.
-
-        With the level 1 it is 0 where all that was drawn lies above the bound, else 1.
-        """
-        if self.scenes is not None and self.scenes < MIN_SCENES:
-            return 1.0
-        return float(not self.interval(level)[0] > bound) if level >= 1 else self._drawn.p_above(bound)
-
-    def p_below(self, bound: float, level: float = LEVEL) -> float:
-        """One-sided p of the number being below a bound."""
-        if self.scenes is not None and self.scenes < MIN_SCENES:
-            return 1.0
-        return float(not self.interval(level)[1] < bound) if level >= 1 else self._drawn.p_below(bound)
-
-    @cached_property
-    def _drawn(self) -> Drawn:
-        return Drawn(self.values, self.freedom, self.left_out)
-
-
-def combine(function: Callable[..., np.ndarray], *means: Mean) -> Mean:
-    """A number computed from several means of one table, draw by draw.
-
-    `function` maps arrays [1 + n + k] float64, one for each mean, to one such array.
-    """
-    with np.errstate(divide="ignore", invalid="ignore"):
-        values = function(*(mean.values for mean in means))
-    return Mean(
-        values,
-        min(mean.count for mean in means),
-        min((mean.scenes for mean in means if mean.scenes is not None), default=None),
-        min(mean.freedom for mean in means),
-        min((mean.trainings for mean in means if mean.trainings), default=0),
-        means[0].left_out,
-    )
 
 
 class Units:
@@ -175,7 +101,7 @@ def _draw_block(values: np.ndarray, numbers: np.ndarray, strata: tuple[int, ...]
     sizes = (counts.sum(axis=0).astype(int), scored.sum(axis=0), _freedom(scored, strata))
     columns = np.ascontiguousarray(means.T)
     for values_drawn, count, scenes, freedom in zip(columns, *(size.tolist() for size in sizes), strict=True):
-        yield Mean(values_drawn, count, scenes, freedom) if scenes else None
+        yield fixed_mean(values_drawn, count, scenes, freedom) if scenes else None
 
 
 def _freedom(scored: np.ndarray, strata: tuple[int, ...]) -> np.ndarray:
@@ -223,39 +149,6 @@ def draw_units(strata: tuple[int, ...], draws: int = DRAWS) -> tuple[tuple[np.nd
             array.setflags(write=False)
         groups.append((members, scale, weights))
     return tuple(sorted(groups, key=lambda group: group[0][0]))
-
-
-@lru_cache(maxsize=64)
-def draw_trainings(variant: str, count: int, draws: int = DRAWS) -> np.ndarray:
-    """[1 + draws count] float64, the weight of each training of a variant in every draw: 1 each in the first row.
-
-    `count` - 1 are drawn and count for `count` / (`count` - 1), as units are; each variant has draws of its own.
-    """
-    rng = np.random.default_rng([SEED, *variant.encode()])
-    drawn = rng.multinomial(count - 1, np.full(count, 1 / count), draws) * (count / (count - 1))
-    weights = np.concatenate([np.ones((1, count)), drawn])
-    weights.setflags(write=False)
-    return weights
-
-
-def pool_trainings(means: Sequence[Mean], variant: str, left_out: Sequence[tuple[str, int]] = ()) -> Mean:
-    """The mean of a variant over its training runs, equally weighted.
-
-    Training runs are drawn first, then scenes, the same for all runs (Owen 2007, "The pigeonhole bootstrap"). `left_out` has
-    the names of all variants with several runs, and their numbers.
-    """
-    values, count = np.stack([mean.values for mean in means], axis=1), len(means)
-    weights = draw_trainings(variant, count, len(values) - 1) if count > 1 else np.ones((1, 1))
-    pooled = (values * weights).sum(axis=1) / count
-    first, numbers = means[0], tuple(number for _, number in left_out)
-    if not numbers:
-        return Mean(pooled, first.count, first.scenes, first.freedom, count)
-    padded = np.full(len(pooled) + sum(numbers), pooled[0])
-    padded[: len(pooled)] = pooled
-    if (variant, count) in left_out:
-        start = len(pooled) + sum(numbers[: left_out.index((variant, count))])
-        padded[start : start + count] = (values[0].sum() - values[0]) / (count - 1)
-    return Mean(padded, first.count, first.scenes, first.freedom, count, numbers)
 
 
 def every_draw(count: int, least: int) -> np.ndarray:

@@ -13,7 +13,8 @@ import numpy as np
 import pandas as pd
 
 from xew.protocol import BASELINES, CODEC_TRUTH, GROUND_TRUTH
-from xew.statistics.bootstrap import Mean, Units, bootstrap_means
+from xew.statistics.bootstrap import Units, bootstrap_means
+from xew.statistics.means import Mean, fixed_mean
 from xew.statistics.power import drop_powerless, find_power
 from xew.statistics.suites import Suited, strict_metrics
 from xew.statistics.verdicts import describe_floors, floor_sources, largest_floor, noise_floor, verdict
@@ -46,6 +47,10 @@ class Summarized(Suited, Protocol):
     @property
     def best(self) -> float | None:
         """Best score; None or infinite where there is none."""
+
+    @property
+    def range(self) -> tuple[float, float]:
+        """Smallest and largest score that is possible; may be infinite."""
 
     @property
     def estimated(self) -> bool:
@@ -129,7 +134,7 @@ def _columns(table: pd.DataFrame) -> list[Column]:
 def _bootstrap(values: np.ndarray, table: pd.DataFrame, units: Units) -> list[Mean]:
     """The mean of each column [n c] of some episodes, which are the rows of a table."""
     means = bootstrap_means(values, units.numbers(cast(pd.MultiIndex, table.index)), units.strata)
-    return [mean or Mean(np.full(1, np.nan), 0, 0) for mean in means]
+    return [mean or fixed_mean(np.full(1, np.nan), 0, 0) for mean in means]
 
 
 def _find_floor(column: Column, means: Mapping[Column, Mean], codecs: Codecs, info: Summarized) -> float:
@@ -147,7 +152,7 @@ def _find_floor(column: Column, means: Mapping[Column, Mean], codecs: Codecs, in
 def _mean_row(column: Column, means: Mapping[Column, Mean], metrics: Mapping[str, Summarized]) -> tuple[Any, ...]:
     metric, model, condition = column
     info, mean, truth = metrics[metric], means[column], means.get((metric, GROUND_TRUTH, ""))
-    numbers = (mean.value, *mean.interval(), mean.count, truth.value if truth else math.nan)
+    numbers = (mean.value, *mean.within(info.range).interval(), mean.count, truth.value if truth else math.nan)
     return info.dimension, metric, info.unit, model, condition, *numbers
 
 

@@ -316,10 +316,11 @@ def test_one_training_is_said_to_be_one_wherever_there_is_an_interval(folder: Pa
     more = [rows.assign(training=0), rows[rows["variant"] == flow].assign(training=1)]
     grades = StudyGrades(pd.concat(more), paper.infos, paper_axes(paper))
     assert trainings_note(grades).startswith(f"Intervals cover scenes and the training runs of {flow} (2).")
-    assert trainings_note(grades).endswith("The other models were trained once.")
+    assert trainings_note(grades).endswith("Differences are taken within the training seeds that both models have.")
     own = pd.concat(more).query("variant == @flow or variant == ''")
     assert trainings_note(StudyGrades(own, paper.infos, paper_axes(paper))) == (
-        "Each model was trained 2 times; intervals cover training runs and scenes."
+        "Each model was trained 2 times; intervals cover training runs and scenes. "
+        "Differences are taken within the training seeds that both models have."
     )
 
 

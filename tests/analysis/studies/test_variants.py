@@ -20,7 +20,7 @@ CHOSEN = {"split", "model.action", "model.embodiment"}
 """Settings that a variant chooses."""
 STUDIES = {
     "small": {"train.steps", "train.keep_checkpoints"},
-    "paper": {"train.keep_checkpoints", "train.sample_every"},
+    "paper": {"train.keep_checkpoints", "train.samples"},
     "bodies": {"train.steps", "train.keep_checkpoints", "train.save_every"},
     "debug": {
         *("clip.frames", "clip.height", "clip.width", "model.size", "train.steps", "train.batch", "train.save_every"),

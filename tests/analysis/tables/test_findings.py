@@ -37,7 +37,7 @@ def scores(tmp_path_factory: pytest.TempPathFactory) -> Scores:
 
 def ask_one(rows: pd.DataFrame, name: str, metrics: tuple[MetricInfo, ...]) -> Finding:
     claim = next(claim for claim in CLAIMS if claim.name == name)
-    return ask(StudyGrades(rows, metrics, paper_axes(read_paper())), [claim])[0]
+    return ask(StudyGrades(rows, metrics, paper_axes(read_paper()), assumed_spread=0), [claim])[0]
 
 
 def scale_scores(rows: pd.DataFrame, variant: str, metric: str, factor: float, robot: str | None = None) -> pd.DataFrame:
@@ -68,7 +68,7 @@ def test_the_papers_figures_bear_out_what_it_claims_but_for_what_they_cannot_sho
 
 
 def test_a_study_like_the_paper_is_answered_as_the_paper_is(scores: Scores) -> None:
-    found = ask(StudyGrades(scores.rows, scores.metrics, paper_axes(read_paper())))
+    found = ask(StudyGrades(scores.rows, scores.metrics, paper_axes(read_paper()), assumed_spread=0))
     answers = {f.claim.name: f.answer for f in found}
     assert {name for name, answer in answers.items() if answer == "fails"} <= FAILS_ON_THE_PAPER
     small = {"clip is no better", "all systems degrade"}  # by 0.7 % and by less than the noise floor of mask IoU
@@ -137,13 +137,13 @@ def test_an_exact_p_decides_claims_about_five_robots(scores: Scores) -> None:
 
 
 def test_comparisons_and_claims_are_corrected_as_families(scores: Scores) -> None:
-    for finding in ask(StudyGrades(scores.rows, scores.metrics, paper_axes(read_paper()))):
+    for finding in ask(StudyGrades(scores.rows, scores.metrics, paper_axes(read_paper()), assumed_spread=0)):
         for one in finding.comparisons:
             assert (one.answer == "holds") == (one.p_holds <= 0.05) and (one.answer == "fails") == (one.p_fails <= 0.05)
         if finding.in_family not in ("unresolved", "not measured"):
             assert finding.in_family == finding.answer, "the answer among all is never bolder than that of the claim alone"
     many = ask_one(scores.rows, "mask keeps outlines", scores.metrics)
-    alone = Reader(StudyGrades(scores.rows, scores.metrics, paper_axes(read_paper())))
+    alone = Reader(StudyGrades(scores.rows, scores.metrics, paper_axes(read_paper()), assumed_spread=0))
     plain = [c.p_values(0.95)[0] for c in many.claim.comparisons(alone)]
     assert [a.p_holds for a in many.comparisons] == pytest.approx(list(holm(plain)))
 
@@ -231,7 +231,7 @@ def test_cells_that_one_row_lacks_count_for_none(scores: Scores) -> None:
 
 
 def test_every_claim_says_what_it_tests_and_the_table_holds_every_number(scores: Scores) -> None:
-    findings = ask(StudyGrades(scores.rows, scores.metrics, paper_axes(read_paper())))
+    findings = ask(StudyGrades(scores.rows, scores.metrics, paper_axes(read_paper()), assumed_spread=0))
     assert len({claim.name for claim in CLAIMS}) == len(CLAIMS) and all(claim.says and claim.test for claim in CLAIMS)
     frame = findings_frame(findings, "here")
     assert len(frame) == sum(len(f.comparisons) or 1 for f in findings) and set(frame["claim"]) == {c.name for c in CLAIMS}
@@ -280,7 +280,7 @@ def test_the_suite_strict_decides_and_the_suites_may_part(scores: Scores) -> Non
     strict = replace(strict, name="robot_lpips", title="Robot LPIPS", counterpart="region_lpips")
     own = scores.rows[scores.rows["metric"] == "region_lpips"].assign(metric="robot_lpips")
     own = scale_scores(own, "fixed-optical_flow-reference_image", "robot_lpips", 3.0)
-    grades = StudyGrades(pd.concat([scores.rows, own]), (*scores.metrics, strict), paper_axes(read_paper()))
+    grades = StudyGrades(pd.concat([scores.rows, own]), (*scores.metrics, strict), paper_axes(read_paper()), assumed_spread=0)
     by_strict, by_paper = ask(StrictGrades(grades)), ask(grades)
     answers = {ours.claim.name: (ours.answer, other.answer) for ours, other in zip(by_strict, by_paper, strict=True)}
     assert answers["one image helps"] == ("fails", "holds")
@@ -291,5 +291,5 @@ def test_the_suite_strict_decides_and_the_suites_may_part(scores: Scores) -> Non
     assert "A first reference image helps a little (strict: fails, paper: holds)" in sentence
     assert "give the same answers" in next(parting_sentence(by_paper, by_paper, True))
     assert "was graded" in next(parting_sentence(by_paper, by_paper, False)) and not list(parting_sentence([], [], True))
-    alone = StudyGrades(scores.rows, scores.metrics, paper_axes(read_paper()))
+    alone = StudyGrades(scores.rows, scores.metrics, paper_axes(read_paper()), assumed_spread=0)
     assert [f.answer for f in ask(StrictGrades(alone))] == [f.answer for f in by_paper], "without it the paper's decide"

@@ -14,7 +14,7 @@ import pytest
 from lab.codec import __main__ as train_codec
 from lab.codec import pictures as pictures_module
 from lab.codec import sampling
-from lab.codec.pictures import Cut, Pictures, cut_description, gather_pictures, read_frames
+from lab.codec.pictures import Cut, Pictures, cut_description, gather_pictures
 from lab.codec.report import choose_robots
 from lab.codec.sampling import Batches, Schedule
 from lab.codec.settings import CodecTrainSettings, load_codec_experiment
@@ -93,8 +93,8 @@ def test_resumed_run_repeats_the_straight_one(world: Path, run: Path) -> None:
     assert stop.value.code == STOPPED
     assert not (out / "autoencoder.safetensors").exists()
     train_codec.main([config, "--out", str(out), "--resume"])
-    assert len(lines(run, "train/loss")) == 4
-    assert lines(out, "train/loss") == lines(run, "train/loss")
+    assert len(lines(run, "loss/train")) == 4
+    assert lines(out, "loss/train") == lines(run, "loss/train")
     assert description(out)["hash"] == description(run)["hash"]
     assert (out / "autoencoder.safetensors").read_bytes() == (run / "autoencoder.safetensors").read_bytes()
 
@@ -208,8 +208,9 @@ def test_a_short_video_is_continued_by_its_last_frame(world: Path) -> None:
     found = gather_pictures(episodes, ["rgb"], Cut(17, 1, 64, 96), 1.0)
     assert found.clips.shape == (1, 17, 64, 96, 3)
     np.testing.assert_array_equal(found.clips[0, 12:], np.repeat(found.clips[0, 11:12], 5, 0))
-    with pytest.raises(EpisodeError, match="damaged or shorter"):
-        read_frames(episodes[0][0] / "rgb.mkv", {12})
+    folder, record = episodes[0]
+    with pytest.raises(EpisodeError, match="has 12 frames, its header says 13"):
+        gather_pictures([(folder, replace(record, frame_count=13))], ["rgb"], Cut(17, 1, 64, 96), 1.0, regions=False)
 
 
 def test_descriptions_of_robots_are_drawn_once_and_taken_whole(world: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -230,7 +231,7 @@ def test_descriptions_of_robots_are_drawn_once_and_taken_whole(world: Path, monk
 
 
 def test_too_many_pictures_are_told_before_any_is_decoded(world: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pictures_module, "read_frames", None)
+    monkeypatch.setattr(pictures_module, "read_pixels", None)
     episodes = select_unpaired(read_dataset(world / "data"), SEEN_ROBOTS, "train")
     with pytest.raises(ConfigError, match=r"more than pictures\.host_gb 1e-06; raise pictures\.every \(now 2\)"):
         gather_pictures(episodes, ["rgb"], CUT, 1e-6)
@@ -296,7 +297,7 @@ def test_a_budget_of_time_ends_the_training(world: Path, monkeypatch: pytest.Mon
         asked = iter([False] * 5 + [True])  # twice a step
         patch.setattr("xew.model.training.loop.StopSignal.is_agreed", lambda signal: next(asked))
         train_codec.main([config, "--out", str(out), "--train.seconds", "10", *options])
-    taken = len(lines(out, "train/loss"))
+    taken = len(lines(out, "loss/train"))
     train_codec.main([config, "--out", str(out), "--train.seconds", "10", *options, "--resume"])
     rates = lines(out, "train/learning_rate")
     assert taken == 3 < len(rates)

@@ -116,20 +116,23 @@ def test_a_checkpoint_that_would_run_code_is_refused(tmp_path: Path) -> None:
 
 
 def test_other_files_are_refused(tmp_path: Path) -> None:
-    array, text, cut, other, causal = (tmp_path / f"{name}.npy" for name in ("array", "text", "cut", "other", "causal_boots"))
+    names = ("array", "text", "cut", "other", "causal_boots", "header")
+    array, text, cut, other, causal, header = (tmp_path / f"{name}.npy" for name in names)
     np.save(array, np.zeros(3))
     text.write_text("no numpy")
     cut.write_bytes(save(tmp_path / "t.npy").read_bytes()[:200])
     np.save(other, {"weights": np.zeros(3)}, allow_pickle=True)
     save(causal)
+    header.write_bytes(b"\x93NUMPY\x01\x00\x06\x00{'a(\n{}")
     reasons = (
         "not one dictionary",
         "no checkpoint of TAPIR",
         "no checkpoint of TAPIR",
         "lacks the parameters",
         "causal network",
+        "no checkpoint of TAPIR",
     )
-    for path, reason in zip((array, text, cut, other, causal), reasons, strict=True):
+    for path, reason in zip((array, text, cut, other, causal, header), reasons, strict=True):
         with pytest.raises(ConfigError, match=reason) as caught:
             read_checkpoint(path)
         assert path.name in str(caught.value)

@@ -11,9 +11,13 @@ from tests.synthetic import write_synthetic_data
 from xew.episode import episode_folder, read_record, read_states, read_video, write_episode
 from xew.metrics import psnr
 from xew.metrics.grading.baselines import BASELINES, find_other_robot, other_robot, pasted_render
+from xew.metrics.grading.grade_episodes import make_baseline
+from xew.metrics.grading.list_jobs import Job
+from xew.metrics.grading.scores import Cell
 from xew.metrics.truth import Truth, read_truth
 from xew.protocol import BASELINES as TITLES
 from xew.protocol import CODEC_TRUTH, OTHER_ROBOT, PASTED_RENDER
+from xew.rollout import RolloutError
 
 TASK, SEED, ROBOTS, FRAMES = "place_empty_cup", 0, ("arx_x5", "franka_panda", "piper"), 9
 
@@ -85,3 +89,13 @@ def test_what_the_data_do_not_hold_is_left_out(data: Path, tmp_path: Path) -> No
     (folder / "robot.mkv").unlink()
     left_out = {name for name, baseline in BASELINES.items() if baseline.source(folder, record) is None}
     assert left_out == {PASTED_RENDER, OTHER_ROBOT}
+
+
+@pytest.mark.parametrize("name", [PASTED_RENDER, OTHER_ROBOT])
+def test_a_baseline_of_an_episode_that_was_replaced_is_refused(name: str, data: Path) -> None:
+    """The digest of what it is made from was taken when the videos were listed."""
+    folder, record = episode(data, "piper"), read_record(episode(data, "piper"))
+    cell = Cell(name, "", TASK, SEED, "piper", FRAMES, BASELINES[name].source(folder, record) or "", "", "", "")
+    assert len(make_baseline(Job(cell, None, folder, record), truth(data, "piper"), {})) == FRAMES
+    with pytest.raises(RolloutError, match="was replaced while this command ran"):
+        make_baseline(Job(replace(cell, prediction="old"), None, folder, record), truth(data, "piper"), {})

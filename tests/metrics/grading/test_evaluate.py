@@ -12,7 +12,7 @@ import pandas as pd
 import pytest
 
 from tests.metrics.grading.graded import ASKED, CHEAP, FRAMES, ROBOTS, SEED, TASK, grade, late, truth, value
-from xew.episode import episode_folder, project, read_record, read_states, read_video, write_episode
+from xew.episode import Record, episode_folder, project, read_record, read_states, read_video, write_episode
 from xew.metrics import METRICS, keypoint_error, mask_iou, perceptual, psnr, ssim
 from xew.metrics.backends import Backend, estimate_masks
 from xew.metrics.episode_cache import EpisodeCache
@@ -74,7 +74,7 @@ def test_every_score_is_the_mean_of_the_functions_without_the_given_frame(rollou
 def test_points_on_surfaces_are_kept_beside_the_data(rollouts: Path, data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folders = []
 
-    def read(folder: Path, frames: int, compared: set[str], cache: Path) -> Truth:
+    def read(folder: Path, frames: int, compared: set[str], cache: Path, record: Record) -> Truth:
         folders.append(cache)
         return read_truth(folder, frames, compared)
 
@@ -89,7 +89,7 @@ class Halved:
     def __init__(self, run: Path) -> None:
         self.model, self.digest, self.sees_render = run.name, "halved", False
 
-    def __call__(self, video: np.ndarray) -> np.ndarray:
+    def __call__(self, video: np.ndarray, render: np.ndarray | None = None) -> np.ndarray:
         return video[:, ::2, ::2].repeat(2, axis=1).repeat(2, axis=2)
 
 

@@ -16,10 +16,12 @@ from xew.model.codecs.autoencoders import ConvAutoencoderCodec
 from xew.model.codecs.contract import CodecSettings, encode_pictures
 from xew.model.codecs.conv_autoencoder import (
     AUTOENCODERS,
+    SIZE,
     AutoencoderSize,
     ConvAutoencoder,
     abstract_autoencoder,
     load_autoencoder,
+    read_stored_size,
     save_weights,
 )
 from xew.model.network.dit import parameter_count
@@ -147,5 +149,15 @@ def test_settings_and_files_that_do_not_fit_are_told(weights: Path, tmp_path: Pa
     (tmp_path / "broken.safetensors").write_bytes(weights.read_bytes()[:1000])
     with pytest.raises(ConfigError, match="not a whole safetensors file"):
         load_autoencoder(tmp_path / "broken.safetensors")
+    for size, said in (
+        ("{", "is no JSON"),
+        ("[" * 100_000, "is no JSON"),
+        ("[]", "expected keys and values"),
+        ("{}", "missing key"),
+    ):
+        save_file(tensors, tmp_path / "size.safetensors", metadata={SIZE: size})
+        read_stored_size.cache_clear()
+        with pytest.raises(ConfigError, match=said):
+            load_autoencoder(tmp_path / "size.safetensors")
     with pytest.raises(ValueError, match="as many stages"):
         AutoencoderSize((8, 8), (1, 1), (8,), (1,))

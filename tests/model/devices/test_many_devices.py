@@ -31,7 +31,7 @@ clip: {frames: 5, height: 32, width: 32}
 codec: {weights: TINY_CODEC}
 model: {size: tiny, action: joints, embodiment: robot_render,
   history: [], reference: frame, visibility: joint, prediction: velocity, dtype: float32, remat: none}
-train: {steps: 4, batch: 4, learning_rate: 1e-3, log_every: 1, save_every: 2, sample_every: 0, ema: 0.25,
+train: {steps: 4, batch: 4, learning_rate: 1e-3, log_every: 1, save_every: 2, samples: 0, ema: 0.25,
   optimizer: adamw, warmup_steps: 0, decay_to: 1, motion_loss_weight: 0}
 rollout: {steps: 1, batch: 4,
   sampler: euler}
@@ -73,7 +73,7 @@ def end(process: subprocess.Popen, code: int = 0) -> str:
 
 def losses(world: Path, out: str) -> np.ndarray:
     logged = [json.loads(line) for line in (world / out / "metrics.jsonl").read_text().splitlines()]
-    return np.array([line["train/loss"] for line in logged if "train/loss" in line])
+    return np.array([line["loss/train"] for line in logged if "loss/train" in line])
 
 
 @pytest.fixture(scope="module")

@@ -57,6 +57,17 @@ def test_nothing_is_trained_on_validation_or_test_seeds() -> None:
     assert {seed_split(record.seed) for _, record in episodes} == {"train"}
 
 
+@pytest.mark.parametrize(("robot", "rate"), [("ur5_wsg", 25.0), ("arx_x5", 250 / 14)])
+def test_training_refuses_mixed_frame_rates(robot: str, rate: float) -> None:
+    """Imported episodes of several rates, also where only replayed ones have the other."""
+    whole = dataset("train", "test", robots=ROBOT_NAMES)
+    cells = [(path, replace(record, frame_rate=rate) if record.robot == robot else record) for path, record in whole.cells]
+    choice = EpisodeChoice(("ur5_wsg",), replay=("arx_x5",))
+    assert len(choose_episodes(whole, choice).replay) == 2
+    with pytest.raises(EpisodeError, match=rf"data has episodes at 16.67 \(2\) and at {rate:.2f} \(2\) frames per second"):
+        choose_episodes(Dataset(whole.root, tuple(cells)), choice)
+
+
 def test_motion_is_never_mixed() -> None:
     """The split names the kind of motion."""
     shared = dataset("train")
@@ -111,5 +122,5 @@ def test_the_ceiling_in_the_log_is_of_no_test_seed_and_of_no_held_out_robot(
         json.dumps({"codec": "its weights", "clip": asdict(Clip(5, 48, 64)), "ceiling": said})
     )
     assert latents.report_ceiling(experiment, cache, data, training, source) == said and len(read) == count
-    cache.codec.hash = "others"
+    cache.codec.decoder_hash = "others"
     assert latents.report_ceiling(experiment, cache, data, training, source) == said and len(read) == 2 * count

@@ -1,5 +1,6 @@
 """Beginning a run: what cannot go on is told before anything of it is written."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -7,10 +8,11 @@ import numpy as np
 import pytest
 
 from tests.networks import TINY_CODEC
+from xew import config
 from xew.config import ConfigError
 from xew.model.codecs.autoencoders import ConvAutoencoderCodec
 from xew.model.experiment import Experiment, load_experiment
-from xew.model.runs.folder import prepare_run
+from xew.model.runs.folder import START, check_start, prepare_run, trace_run
 from xew.model.runs.layout import RUN_MARK, is_run
 from xew.model.settings.settings import AdaptSettings
 
@@ -68,3 +70,38 @@ def test_a_run_that_was_killed_while_it_was_begun_is_begun_again(experiment: Exp
     (begun.out / "config.yaml").unlink()
     with pytest.raises(ConfigError, match="is not empty and holds no run"):
         prepare_run(begun, codec, {}, resume=True, overwrite=False)
+
+
+def write_chain(root: Path, experiment: Experiment, starts: dict[str, str]) -> None:
+    """Runs that were adapted by LoRA from one another, by name, without checkpoints."""
+    for name, start in starts.items():
+        adapt = AdaptSettings(start_from=root / start if start else None, robots=("piper",), lora_rank=4 if start else 0)
+        config.save(
+            replace(experiment, out=root / name, adapt=adapt if start else AdaptSettings()), root / name / "config.yaml"
+        )
+        (root / name / START).write_text(json.dumps({"run": start, "step": 4, "saved": None}))
+
+
+@pytest.mark.parametrize(
+    ("starts", "lineage"),
+    [
+        ({"a": ""}, ["a"]),
+        ({"a": "b", "b": "c", "c": ""}, ["c", "b", "a"]),
+        ({"a": "a"}, "a was adapted from itself"),
+        ({"a": "b", "b": "a"}, "a was adapted from itself"),
+        ({"a": "b", "b": "c", "c": "b"}, "b was adapted from itself"),
+        ({"a": "b/../a", "b": ""}, "a was adapted from itself"),
+    ],
+)
+def test_runs_are_traced_to_their_start_or_to_a_circle(
+    starts: dict[str, str], lineage: list[str] | str, experiment: Experiment, tmp_path: Path
+) -> None:
+    write_chain(tmp_path, experiment, starts)
+    if isinstance(lineage, list):
+        assert [kept.run.name for kept in trace_run(tmp_path / "a")] == lineage
+        return
+    with pytest.raises(ConfigError, match=lineage):
+        trace_run(tmp_path / "a")
+    asked = AdaptSettings(start_from=tmp_path / "a", robots=("piper",))
+    with pytest.raises(ConfigError, match=lineage):
+        check_start(replace(experiment, out=tmp_path / "new", adapt=asked))

@@ -1,14 +1,18 @@
 """What a run logs: the same numbers in metrics.jsonl and in TensorBoard, each step once, also where steps were lost."""
 
+import io
 import json
 from pathlib import Path
 
+import numpy as np
+import pytest
+from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.plugins.hparams import metadata
 
 from xew.model.runs.log import RunLog
 
-NAME = "train/loss"
+NAME = "loss/train"
 
 
 def log(folder: Path, begin: int, values: dict[int, float]) -> None:
@@ -56,6 +60,17 @@ def test_a_run_begins_with_its_settings(tmp_path: Path) -> None:
         "train.ema": True,
         "train.of": "['a', 'b']",
     }
+
+
+@pytest.mark.parametrize(("rate", "milliseconds"), [(1000 / 60, 120), (25.0, 80)])
+def test_sample_videos_play_at_half_their_rate(rate: float, milliseconds: int, tmp_path: Path) -> None:
+    written = RunLog(tmp_path, 0)
+    written.video(10, "sample", np.arange(3 * 8 * 8 * 3, dtype=np.uint8).reshape(3, 8, 8, 3), rate)
+    written.close()
+    accumulator = EventAccumulator(str(tmp_path))
+    accumulator.Reload()
+    with Image.open(io.BytesIO(accumulator.Images("sample")[0].encoded_image_string)) as animation:
+        assert (animation.n_frames, animation.info["duration"]) == (3, milliseconds)
 
 
 def test_steps_that_were_lost_are_taken_back(tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ class Copy:
         self.lengths.append(len(video))
         return np.concatenate([255 - video[:1], video[1:]])
 
-    def decode(self, latents: np.ndarray) -> np.ndarray:
+    def decode(self, latents: np.ndarray, given: object = None) -> np.ndarray:
         return latents
 
 

@@ -119,6 +119,21 @@ def test_embeddings_are_computed_once_and_outlive_the_files(
         asked.instructions.encode(TEXTS)
 
 
+@pytest.mark.parametrize("content", [b"", b"no array", "other form", "a folder"], ids=str)
+def test_damaged_embeddings_are_computed_again(content: object, files: Path, tmp_path: Path) -> None:
+    asked = umt5(files, tmp_path)
+    first = asked.instructions.encode(TEXTS[:1])[TEXTS[0]]
+    (path,) = tmp_path.rglob("*.npy")
+    path.unlink()
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    elif content == "other form":
+        np.save(path, np.zeros(3))
+    (notes,) = tmp_path.rglob("sources.json")
+    notes.write_text("[1")
+    np.testing.assert_array_equal(asked.instructions.encode(TEXTS[:1])[TEXTS[0]], first)
+
+
 def test_other_weights_are_another_cache(files: Path, tmp_path: Path) -> None:
     before = umt5(files, tmp_path).instructions.encode(TEXTS[:1])[TEXTS[0]]
     other = tmp_path / "other"

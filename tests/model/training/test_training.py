@@ -33,13 +33,7 @@ from xew.model.training.data import Batch, ClipSource, fake_batch
 from xew.model.training.flops import flops_of_step
 from xew.model.training.memory import estimate_memory
 from xew.model.training.order import make_dataset
-from xew.model.training.step import (
-    cut_samples,
-    estimate_clean,
-    join_samples,
-    make_trainer,
-    sample_pairs,
-)
+from xew.model.training.step import cut_samples, estimate_clean, join_samples, make_trainer, sample_pairs
 from xew.protocol import HELD_OUT_ROBOTS, seed_split
 
 FRAMES = 12
@@ -48,7 +42,7 @@ clip: {frames: 5, height: 64, width: 80}
 codec: {weights: TINY_CODEC}
 model: {size: tiny, action: joints, embodiment: robot_render,
   history: [], reference: frame, visibility: joint, prediction: velocity, dtype: float32, remat: none}
-train: {steps: 2, batch: 2, learning_rate: 1e-3, log_every: 1, save_every: 1, sample_every: 0,
+train: {steps: 2, batch: 2, learning_rate: 1e-3, log_every: 1, save_every: 1, samples: 0,
   optimizer: adamw, warmup_steps: 0, decay_to: 1, ema: 0, motion_loss_weight: 0}
 rollout: {steps: 2, batch: 3,
   sampler: euler}
@@ -229,7 +223,7 @@ def test_two_chunks_from_latents_to_a_run(world: Path, tmp_path: Path) -> None:
     config = [str(world / "config.yaml"), "--train.chunks", "2", "--cache", str(tmp_path / "cache")]
     latents.main(config)
     train.main([*config, "--out", str(tmp_path / "run")])
-    assert len(lines(tmp_path / "run", "train/loss")) == 2
+    assert len(lines(tmp_path / "run", "loss/train")) == 2
     experiment = load_experiment(tmp_path / "run" / "config.yaml")
     episodes = training_episodes(read_dataset(experiment.data), experiment.choice)
     source = ClipSource.open(experiment.encoding, experiment.instructions, episodes)
@@ -276,12 +270,13 @@ def test_too_little_memory_is_told_before_anything_is_made(
     assert "mesh.fsdp" in said and "--model.remat full" in said and "--ignore-memory" in said
     assert not (tmp_path / "run").exists()
     train.main([*arguments, "--ignore-memory"])
-    assert len(lines(tmp_path / "run", "train/loss")) == 2
+    assert len(lines(tmp_path / "run", "loss/train")) == 2
 
 
 def test_log_lines_hold_what_a_run_is_watched_by(world: Path) -> None:
     run = world / "run"
-    for name in ("train/learning_rate", "time/step_s", "time/data_wait_s", "time/samples_per_s", "train/gradient_norm"):
+    workload = [f"workload/{name}" for name in ("step_s", "data_wait_s", "samples_per_s")]
+    for name in ("train/learning_rate", "train/gradient_norm", *workload):
         values = lines(run, name)
         assert len(values) == 2 and all(value >= 0 for value in values), name
     assert lines(run, "train/learning_rate") == pytest.approx([1e-3, 1e-3])
@@ -403,18 +398,15 @@ def test_arithmetic_that_one_way_streams_save_is_not_counted(experiment: Experim
     assert flops_of_step(one_way.spec) < flops_of_step(experiment.spec)
 
 
-def test_episodes_without_videos_are_told_before_training(
-    world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Data made with --states-only: a sample begins with a stored picture, and would end a run in its middle."""
+def test_episodes_without_videos_give_no_samples(world: Path, tmp_path: Path) -> None:
+    """Data made with --states-only: a sample begins with a stored picture."""
     shutil.copytree(world / "data", tmp_path / "data")
     shutil.copytree(world / "data-latents", tmp_path / "data-latents")
     for path in (tmp_path / "data").glob("*/*/*/episode.json"):
         path.write_text(json.dumps(json.loads(path.read_text()) | {"videos": False}))
     arguments = [str(world / "config.yaml"), "--data", str(tmp_path / "data"), "--out", str(tmp_path / "run")]
-    assert "--train.sample-every 0" in fails(train.main, [*arguments, "--train.sample-every", "1"], capsys)
-    assert not (tmp_path / "run").exists()
-    train.main([*arguments, "--train.steps", "1"])
+    train.main([*arguments, "--train.steps", "1", "--train.samples", "1"])
+    assert not lines(tmp_path / "run", "validation/psnr/seen")
 
 
 # Adaptation.
@@ -481,7 +473,7 @@ def test_adapted_run_starts_from_the_trained_weights(world: Path, tmp_path: Path
 
 def test_samples_of_an_adapted_run_are_named_by_role(experiment: Experiment) -> None:
     adapt = replace(experiment.adapt, start_from=Path("runs/x"), robots=("piper",))
-    adapted = replace(experiment, adapt=adapt, train=replace(experiment.train, sample_every=1))
+    adapted = replace(experiment, adapt=adapt, train=replace(experiment.train, samples=1))
     names = sample_episodes(read_dataset(adapted.data), adapted.choice.samples)
     seen = {"seen/aloha_agilex", "seen/arx_x5", "seen/ur5_wsg"}
     assert set(names) == seen | {"target/piper"}
@@ -550,7 +542,7 @@ def test_run_with_corrections_resumes_and_is_read(world: Path, tmp_path: Path, c
     train.main([*arguments, "--train.steps", "3", "--resume"])
     straight = adapt(world, tmp_path / "straight", "--adapt.lora-rank", "2", "--adapt.start-from", str(base))
     train.main([*straight, "--train.steps", "3"])
-    assert lines(tmp_path / "run", "train/loss") == lines(tmp_path / "straight", "train/loss")
+    assert lines(tmp_path / "run", "loss/train") == lines(tmp_path / "straight", "loss/train")
 
     after, step = network(tmp_path / "run")
     before, _ = network(base)
@@ -569,6 +561,31 @@ def test_run_with_corrections_resumes_and_is_read(world: Path, tmp_path: Path, c
     (elsewhere / "start.json").unlink()
     with pytest.raises(ConfigError, match="does not say from which checkpoint"):
         network(elsewhere)
+
+
+def test_a_run_is_resumed_with_the_episodes_that_it_was_begun_with(
+    world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The same elsewhere; not without a task, nor with another seed, nor with other content."""
+    shutil.copytree(world / "run", tmp_path / "run")
+    shutil.copytree(world / "data", tmp_path / "data")
+    resume = [str(world / "config.yaml"), "--out", str(tmp_path / "run"), "--resume", "--train.steps", "3"]
+    resume += ["--data", str(tmp_path / "data"), "--cache", str(tmp_path / "cache")]
+    latents.main([*resume[:1], *resume[-4:]])
+    shutil.move(tmp_path / "data/shake_bottle", tmp_path / "shake_bottle")
+    synthetic.write_synthetic_data(tmp_path / "data", ("place_empty_cup",), seeds=(2,), frames=FRAMES)
+    changed = next((tmp_path / "data/place_empty_cup/0000001").glob("ur5_wsg/episode.json"))
+    changed.write_text(json.dumps(json.loads(changed.read_text()) | {"instruction": "another"}))
+    latents.main([*resume[:1], *resume[-4:]])
+    said = fails(train.main, resume, capsys)
+    line = said.splitlines()[-1]
+    assert "was begun with 12 episodes, and --data has others: 6 missing (such as shake_bottle/0/" in line
+    assert "3 new (such as place_empty_cup/2/" in line and "1 of other content (such as place_empty_cup/1/ur5_wsg)" in line
+    assert line.startswith("error: ") and network(tmp_path / "run")[1] == 2
+    shutil.rmtree(tmp_path / "data")
+    (tmp_path / "data").symlink_to(world / "data")
+    train.main(resume)
+    assert network(tmp_path / "run")[1] == 3
 
 
 def test_checkpoint_of_a_step_that_is_not_there_is_told(world: Path) -> None:

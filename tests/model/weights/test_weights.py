@@ -16,6 +16,7 @@ from safetensors.numpy import load_file, save_file
 from tests.golden import golden
 from tests.networks import world_model
 from xew.config import ConfigError
+from xew.metrics.estimators.adapters import read_state_dict
 from xew.model.network.dit import MODELS, WorldModel
 from xew.model.network.dit_layouts import (
     check_dit,
@@ -260,6 +261,65 @@ def test_nothing_is_unpickled(tmp_path: Path) -> None:
     assert not touched.exists()
     torch.save({"epoch": 3}, tmp_path / "none.pth")
     assert "holds no tensors by name" in refusal(tmp_path / "none.pth")
+
+
+@pytest.mark.lab
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b"", "it is empty"),
+        (b"version https://git-lfs.github.com/spec/v1\noid sha256:abc\n", "it is a text that begins with 'version https://git"),
+        (b"unauthorized: please log in\n", "it is a text that begins with 'unauthorized"),
+        (b"<html><body>404</body></html>", "it is a text that begins with '<html>"),
+        (bytes(1000), ""),
+        (b"PK\x03\x04" + bytes(50), ""),
+        (b"\x80\x04\x95\xff\xff\xff\xff", ""),
+        *((letter.encode() + b"rl=1 text\nmore\n", "it is a text that begins with") for letter in "().GNQRUX]abeqrstuhj}"),
+    ],
+)
+def test_files_that_are_no_checkpoint_are_refused(content: bytes, said: str, tmp_path: Path) -> None:
+    """PyTorch's reader raises IndexError, KeyError and others for them."""
+    path = tmp_path / "a.pth"
+    path.write_bytes(content)
+    for reader in (read_tensors, lambda path: read_state_dict(path, "CoTracker3")):
+        with pytest.raises(ConfigError, match=r"a\.pth is no whole checkpoint of \w+: .*; download it again"):
+            reader(path)
+    assert said in refusal(path)
+
+
+@pytest.mark.parametrize("kind", ["F8_E4M3", "F8_E5M2", "F6_E2M3"])
+def test_types_that_numpy_lacks_are_refused(kind: str, tmp_path: Path) -> None:
+    """Weights of 8 bits, as other tools make them."""
+    size = {"F8_E4M3": 8, "F8_E5M2": 8, "F6_E2M3": 6}[kind]
+    header = json.dumps({"a": {"dtype": kind, "shape": [8], "data_offsets": [0, size]}}).encode()
+    (tmp_path / "a.safetensors").write_bytes(len(header).to_bytes(8, "little") + header + bytes(size))
+    tensors = read_tensors(tmp_path / "a.safetensors")
+    with pytest.raises(ConfigError, match=r"a\.safetensors: a cannot be read \(.*\); get these weights in bfloat16"):
+        tensors["a"]
+
+
+@pytest.mark.parametrize(
+    ("header", "data"),
+    [
+        ({"a": {"dtype": "F32", "shape": [2**40], "data_offsets": [0, 8]}}, 8),
+        ({"a": {"dtype": "F32", "shape": [2**40], "data_offsets": [0, 2**42]}}, 8),
+        ({"a": {"dtype": "F32", "shape": [2**33, 2**33], "data_offsets": [0, 8]}}, 8),
+        ({"a": {"dtype": "F32", "shape": [-2], "data_offsets": [0, 8]}}, 8),
+        ({"a": {"dtype": "F32", "shape": [2], "data_offsets": [0, 8]}}, 800),
+        ({"__metadata__": {"a": 1}}, 0),
+    ],
+)
+def test_headers_that_promise_other_sizes_are_refused(header: dict, data: int, tmp_path: Path) -> None:
+    text = json.dumps(header).encode()
+    for length in (len(text), 2**62, 99_000_000):
+        (tmp_path / "a.safetensors").write_bytes(length.to_bytes(8, "little") + text + bytes(data))
+        assert "is not a whole safetensors file" in refusal(tmp_path / "a.safetensors")
+
+
+def test_hidden_files_in_a_folder_are_no_weights(arrays: Arrays, tmp_path: Path) -> None:
+    save_file(arrays, tmp_path / "model.safetensors")
+    (tmp_path / "._model.safetensors").write_bytes(b"\0\5\x16\7" + bytes(4092))
+    assert read_tensors(tmp_path).keys() == arrays.keys()
 
 
 def test_prefixes_are_taken_off(arrays: Arrays, tmp_path: Path) -> None:

@@ -48,7 +48,7 @@ def test_a_film_holds_every_video_in_its_tile_and_a_frame_at_its_time(tmp_path: 
     first, second, third = (np.broadcast_to(c, (30, 21, 32, 3)).astype(np.uint8) for c in colors)
     rows = [[first, second[:20, :20]], [None, third]]
     assert tile_size(rows) == (22, 32)
-    write_film(tmp_path / "film.mp4", tile_frames(rows, 30), 1000 / 60)
+    write_film(tmp_path / "film.mp4", tile_frames(rows, 30), 1000 / 60, within=tmp_path)
     film = read_video(tmp_path / "film.mp4").astype(int)
     assert film.shape == (30, 44, 64, 3)
     for row, column, video in ((0, 0, first), (0, 1, second[[*range(20), *[19] * 10], :20]), (1, 1, third)):
@@ -195,10 +195,17 @@ def test_rollouts_may_begin_with_frame_1(folder: Path, tmp_path: Path) -> None:
 def test_a_frame_rate_that_no_film_has_is_an_error(folder: Path, tmp_path: Path) -> None:
     cells = [(folder, read_record(folder))]
     for change in ({"frame_rate": 1e-9}, {"frame_rate": 1e9}):
-        with pytest.raises(EpisodeError, match="expected as many in both, at 1 to 1000 a second"):
+        with pytest.raises(EpisodeError, match="expected 1 to 1000 frames per second"):
             write_page(
                 Page("t", choose_scenes([(folder, replace(cells[0][1], **change))], (), 6, {})[0], 0, {}), tmp_path / "b"
             )
+
+
+def test_a_scene_has_one_frame_rate(folder: Path, tmp_path: Path) -> None:
+    record = read_record(folder)
+    scenes, _ = choose_scenes([(folder, record), (folder, replace(record, robot="ur5_wsg", frame_rate=25.0))], (), 6, {})
+    with pytest.raises(EpisodeError, match=r"at 16.67 \(1\) and at 25.00 \(1\) frames per second, which cannot be mixed"):
+        write_page(Page("t", scenes, 0, {}, flow=False), tmp_path / "page")
 
 
 def test_another_page_is_kept_and_an_own_one_replaced(tmp_path: Path) -> None:

@@ -250,8 +250,19 @@ def test_kept_points_are_of_one_robot_scene_motion_and_camera(data: Path, tmp_pa
     assert len({key, *others}) == 5
     tracks = read_surfaces(folder)
     assert tracks is not None
-    save_tracks(tmp_path / "tracks.npz", key, tracks)
-    assert load_tracks(tmp_path / "tracks.npz", key) is not None and load_tracks(tmp_path / "tracks.npz", others[0]) is None
+    path, shape = tmp_path / "tracks.npz", states.robot_mask.shape
+    save_tracks(path, key, tracks)
+    assert load_tracks(path, key, shape) is not None and load_tracks(path, others[0], shape) is None
+    for damage in (
+        {"pixels": tracks.pixels[:-1]},
+        {"pixels": tracks.pixels.astype(int)},
+        {"shown": tracks.shown[:-1]},
+        {"shown": tracks.shown + np.int16(99)},
+        {"body": tracks.body - np.int32(9)},
+        {"names": tracks.names[:-1]},
+    ):
+        save_tracks(path, key, replace(tracks, **damage))
+        assert load_tracks(path, key, shape) is None, damage.keys()
 
 
 def test_measured_states_are_not_the_commands(data: Path) -> None:

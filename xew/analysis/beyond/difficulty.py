@@ -9,8 +9,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
-from scipy.stats import BootstrapMethod, PermutationMethod, pearsonr
+from scipy.stats import BootstrapMethod, pearsonr
 
+from xew.analysis.correlation import permutation_p
 from xew.analysis.paper import AXES, PAPER_TITLES
 from xew.analysis.scores import COPY, MetricInfo
 from xew.analysis.statistics.grades import StudyGrades
@@ -34,7 +35,7 @@ class BodyCorrelation:
     """Lower end of its 95 % interval over bodies (bootstrap, BCa)."""
     high: float
     p_value: float
-    """Two-sided, by permutation of the bodies; of the paper's two kinds of distance corrected by Holm for both."""
+    """Two-sided (`permutation_p`); of the paper's two kinds of distance corrected by Holm for both."""
     frozen: float
     """Pearson's r of distance with the error of the frozen first frame; NaN where that was not graded or does not vary."""
     partial: float
@@ -105,7 +106,7 @@ def correlate_bodies(errors: pd.DataFrame, higher_is_better: bool) -> dict[str, 
 
 def _correlate(distance: np.ndarray, score: np.ndarray, frozen: np.ndarray) -> BodyCorrelation:
     """Correlation of n distances with n scores and those of the frozen first frame, each [n] float64."""
-    result = pearsonr(distance, score, method=PermutationMethod(n_resamples=DRAWS, rng=np.random.default_rng(0)))
+    result = pearsonr(distance, score)
     resampling = BootstrapMethod(n_resamples=DRAWS, method="BCa", rng=np.random.default_rng(0))
     interval = result.confidence_interval(LEVEL, method=resampling)
     r, with_frozen, partial = float(result.statistic), np.nan, np.nan
@@ -113,7 +114,7 @@ def _correlate(distance: np.ndarray, score: np.ndarray, frozen: np.ndarray) -> B
         with_frozen, between = float(pearsonr(distance, frozen).statistic), float(pearsonr(score, frozen).statistic)
         partial = (r - with_frozen * between) / np.sqrt((1 - with_frozen**2) * (1 - between**2))
     low, high = map(float, interval)
-    return BodyCorrelation(r, low, high, float(result.pvalue), with_frozen, float(partial), len(score))
+    return BodyCorrelation(r, low, high, float(permutation_p(distance, score)), with_frozen, float(partial), len(score))
 
 
 def difficulty_table(found: Mapping[str, OverBodies], metrics: Mapping[str, MetricInfo]) -> Table | None:

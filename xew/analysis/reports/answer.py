@@ -21,10 +21,10 @@ from xew.analysis.scores import COPY, TRUTH
 from xew.analysis.statistics.grades import StudyGrades, find_variant
 from xew.analysis.tables.builder import interval_ends
 from xew.analysis.tables.labels import ACTIONS, LADDER, ROBOT_TITLES
-from xew.episode import read_record, read_states, read_video
+from xew.episode import read_pixels, read_record, read_states
 from xew.model.conditions import make_command, pasted_render
 from xew.protocol import BASELINES, HELD_OUT_ROBOTS, PASTED_RENDER
-from xew.rollout import Rollout, read_rollout_video
+from xew.rollout import Rollout, read_as_graded
 from xew.statistics import BETTER, UNRESOLVED, WORSE, combine, verdict
 
 METRIC = "lpips"
@@ -129,8 +129,8 @@ def answer_strip(episodes: Mapping[str, tuple[Path, Rollout]], frame_zero: str) 
     """Truth, prediction and pasted render of the episode and rollout of each robot's title; None without an episode."""
     frames = []
     for folder, rollout in episodes.values():
-        truth = read_video(folder / "rgb.mkv")
-        predicted = pictures.fit_to_episode(read_rollout_video(rollout), truth, frame_zero)
+        truth = read_pixels(folder, "rgb")
+        predicted = read_as_graded(rollout, truth, frame_zero != "absent")
         pasted = pasted_render(make_command(folder, read_record(folder), read_states(folder)))
         t = 3 * (len(predicted) - 1) // 4
         frames.append([truth[t], predicted[t], pasted[t]])

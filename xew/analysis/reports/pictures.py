@@ -7,8 +7,6 @@ import cv2
 import matplotlib
 import numpy as np
 
-from xew.rollout import resize_video
-
 GAP = 4
 """Width of the gap between the pictures of a sheet [px]."""
 DIFFERENCE_FULL = 96
@@ -27,14 +25,6 @@ def difference_picture(predicted: np.ndarray, observed: np.ndarray) -> np.ndarra
     picture = (matplotlib.colormaps["gist_heat_r"](np.minimum(difference, 1))[..., :3] * 255).astype(np.uint8)
     height, width = picture.shape[:2]
     return cv2.rectangle(picture, (0, 0), (width - 1, height - 1), FRAME, 1)  # else white on white has no edge
-
-
-def fit_to_episode(video: np.ndarray, truth: np.ndarray, frame_zero: str) -> np.ndarray:
-    """A rollout's video [t h w 3] uint8 at the size and frames of its episode `truth` [t h w 3] uint8, as it was graded."""
-    video = resize_video(video, truth.shape[1:3])
-    if frame_zero == "absent":
-        video = np.concatenate([truth[:1], video])
-    return video[: len(truth)]
 
 
 def strip_times(frame_count: int, count: int = 5) -> list[int]:

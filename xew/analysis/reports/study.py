@@ -83,11 +83,11 @@ HERE, BY_PAPER, PRINTED = "here", "here, paper's definitions", "paper"
 """Sources of answers to claims: the scores by the suite strict, the scores by the paper's definitions, the paper's figures."""
 CLAIMS_TEXT = (
     "Each claim of the paper is tested as inequalities, on this study and on the paper's printed figures. A claim holds if "
-    "all numbers lie on its side of the bound, and fails if one lies on the other side, at 5 % after Holm's correction within "
-    "the claim. Otherwise it is unresolved. “Among all claims” corrects for all claims. Claims of equality are equivalences: "
-    "two one-sided tests with the margins in the claim. Strict metrics decide; answers by the paper's definitions are shown "
-    "where they differ. Claims about conditioning also say whether the models beat the paste baseline. Claims marked “ours” "
-    "are stricter than the paper's."
+    "all numbers lie on its side of the bound, and fails if one lies on the other side, at 5 % after Holm's correction for the "
+    "numbers of the claim and for all claims. Otherwise it is unresolved. “Asked alone” leaves out the second correction. "
+    "Claims of equality are equivalences: two one-sided tests with the margins in the claim. Strict metrics decide; answers by "
+    "the paper's definitions are shown where they differ. Claims about conditioning also say whether the models beat the paste "
+    "baseline. Claims marked “ours” are stricter than the paper's."
 )
 FRAME_CHARTS = {"actions": "frames_actions", "ladder": "frames_ladder"}
 

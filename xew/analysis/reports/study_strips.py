@@ -12,9 +12,9 @@ from xew.analysis.scores import VARIANT, Scores
 from xew.analysis.statistics.grades import find_variant
 from xew.analysis.tables.labels import ACTIONS, LADDER, ROBOT_TITLES, SHORT_ROBOTS, SYSTEMS
 from xew.config import ConfigError
-from xew.episode import episode_folder, read_video
+from xew.episode import episode_folder, read_pixels
 from xew.protocol import HELD_OUT_ROBOTS, ROBOT_NAMES, SHOTS, VARIANTS
-from xew.rollout import Rollout, find_rollouts, read_rollout_video
+from xew.rollout import Rollout, find_rollouts, read_as_graded
 
 RANKED_BY = "lpips"
 """Metric by which the median scene is found."""
@@ -106,9 +106,9 @@ def _make_strip(
     labels = [label for label, by_robot in names.items() if all((by_robot[r], task, seed, r) in videos for r in robots)]
     shown = []
     for robot in robots:
-        truth = read_video(episode_folder(data, task, seed, robot) / "rgb.mkv")
-        predicted = [read_rollout_video(videos[names[label][robot], task, seed, robot]) for label in labels]
-        shown.append([truth, *(pictures.fit_to_episode(video, truth, scores.frame_zero) for video in predicted)])
+        truth = read_pixels(episode_folder(data, task, seed, robot), "rgb")
+        predicted = [videos[names[label][robot], task, seed, robot] for label in labels]
+        shown.append([truth, *(read_as_graded(rollout, truth, scores.frame_zero != "absent") for rollout in predicted)])
     moment = min(len(video) for row in shown for video in row) - 1
     caption = f"{task.replace('_', ' ')}, seed {seed}, frame {moment}: the scene with the median LPIPS."
     image = pictures.encode_png(pictures.sheet([[video[moment] for video in row] for row in shown]))

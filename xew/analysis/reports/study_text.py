@@ -16,20 +16,25 @@ from xew.analysis.tables.findings import BEATS, FAILS, HOLDS, UNMEASURED, UNRESO
 from xew.analysis.tables.labels import ACTIONS, LADDER, REMEDIES, ROBOT_TITLES, SHORT_ROBOTS
 from xew.analysis.tables.table import format_change, format_signed
 from xew.protocol import BODY_SCALES, FORGETTING_ROBOT, HELD_OUT_ROBOTS, PAPER_PARTS, PARTS
-from xew.statistics import LEVEL, Mean, strict_metrics
+from xew.statistics import ASSUMED_SPREAD, LEVEL, Mean, strict_metrics
 
 
 def trainings_note(grades: StudyGrades) -> str:
-    """Sentence that says whether a study's intervals cover one training run of each model, or several."""
+    """Sentence that says which training runs a study's intervals cover, and what spread those of a single run carry."""
     counts = {name: grades.trainings(name) for name in grades.variants}
-    several = {name: count for name, count in counts.items() if count > 1}
-    if not several:
-        return "Each model was trained once; intervals cover scenes, not training runs." if counts else ""
+    if not counts:
+        return ""
+    if max(counts.values()) == 1:
+        return f"Each model was trained once; intervals carry an assumed spread between training runs of {ASSUMED_SPREAD:.0%}."
+    paired = "Differences are taken within the training seeds that both models have."
     if len(set(counts.values())) == 1:
-        return f"Each model was trained {next(iter(counts.values()))} times; intervals cover training runs and scenes."
-    named = ", ".join(f"{name} ({count})" for name, count in several.items())
-    rest = " The other models were trained once." if len(several) < len(counts) else ""
-    return f"Intervals cover scenes and the training runs of {named}.{rest}"
+        times = next(iter(counts.values()))
+        return f"Each model was trained {times} times; intervals cover training runs and scenes. {paired}"
+    named = ", ".join(f"{name} ({count})" for name, count in counts.items() if count > 1)
+    rest = ""
+    if min(counts.values()) == 1:
+        rest = " The other models were trained once; their intervals carry the spread between these runs."
+    return f"Intervals cover scenes and the training runs of {named}.{rest} {paired}"
 
 
 def study_sentences(
@@ -85,7 +90,7 @@ def pasting_sentence(findings: Sequence[Finding]) -> Iterator[str]:
 
 def find_parting_claims(findings: Sequence[Finding], by_paper: Sequence[Finding]) -> list[tuple[Finding, Finding]]:
     """Claims with two different answers: by the strict metrics, and by the paper's definitions."""
-    return [(ours, other) for ours, other in zip(findings, by_paper, strict=True) if ours.answer != other.answer]
+    return [(ours, other) for ours, other in zip(findings, by_paper, strict=True) if ours.in_family != other.in_family]
 
 
 def parting_sentence(findings: Sequence[Finding], by_paper: Sequence[Finding], graded: bool) -> Iterator[str]:
@@ -99,7 +104,7 @@ def parting_sentence(findings: Sequence[Finding], by_paper: Sequence[Finding], g
         yield "No strict metric was graded, so all answers use the paper's metric definitions."
         return
     parts = [
-        f"{_claim_text(ours)} (strict: {ours.answer}, paper: {other.answer})"
+        f"{_claim_text(ours)} (strict: {ours.in_family}, paper: {other.in_family})"
         for ours, other in find_parting_claims(findings, by_paper)
     ]
     others = f"differ for: {'; '.join(parts)}" if parts else "give the same answers"
@@ -115,7 +120,7 @@ def _answer_sentence(findings: Sequence[Finding]) -> str:
     tested = [finding for finding in claims if finding.answer != UNMEASURED]
     if not tested:
         return f"The scores answer none of the paper's {len(claims)} claims."
-    held, failed = ([finding for finding in tested if finding.answer == answer] for answer in (HOLDS, FAILS))
+    held, failed = ([finding for finding in tested if finding.in_family == answer] for answer in (HOLDS, FAILS))
     rest = "; the others are unresolved" if len(held) + len(failed) < len(tested) else ""
     scope = f"All {len(claims)}" if len(tested) == len(claims) else f"{len(tested)} of the {len(claims)}"
     text = f"{scope} claims of the paper were tested. {len(held) or 'None'} held and {len(failed) or 'none'} failed{rest}."

@@ -4,12 +4,12 @@ A mean has the same address in our study and in the paper: (part, row, robots, m
 "franka_panda", "lpips"). Parts and rows are named as in `paper.py`; robots are one robot, or 'seen' for the pooled training
 robots.
 
-The means of `StudyGrades` vary over resamples of training runs and scenes, one resample of scenes for all cells, so differences
-and ratios (`xew.statistics.combine`) are paired by scene. The means of `PaperGrades` vary over all values that print the same.
+The means of `StudyGrades` vary over resamples of training runs and scenes, one resample for all cells, so differences and
+ratios (`xew.statistics.combine`) are paired by scene and by training seed. A variant with one run carries the spread between
+runs of the variants with several, the anchors. The means of `PaperGrades` vary over all values that print the same.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from functools import cached_property
 from typing import ClassVar, Protocol
 
@@ -18,21 +18,36 @@ import pandas as pd
 
 from xew.analysis.paper import Paper
 from xew.analysis.scores import TRAINING, TRUTH, MetricInfo, name_graded
-from xew.protocol import BASELINES, CODEC_TRUTH, MULTI_VIEW, PARTS, ROBOT_NAMES, SPLITS, UNSEEN_BODIES, Variant, reference
+from xew.protocol import (
+    BASELINES,
+    CODEC_TRUTH,
+    MULTI_VIEW,
+    PARTS,
+    ROBOT_NAMES,
+    SPLITS,
+    UNSEEN_BODIES,
+    VARIANTS,
+    Variant,
+    reference,
+)
 from xew.statistics import (
+    ASSUMED_SPREAD,
     DRAWS,
     LEVEL,
     Mean,
+    RunSpread,
     bootstrap_means,
     combine,
     describe_floors,
     describe_power,
+    find_spread,
     find_strata,
+    fixed_mean,
     floor_sources,
     largest_floor,
     measure_power,
     noise_floor,
-    pool_trainings,
+    pool_runs,
 )
 from xew.statistics.power import find_powerless
 
@@ -42,10 +57,6 @@ TOGETHER = {
     "baselines": ("baselines", "more_systems"),
 }
 """Parts of the protocol that are ours and stand in a part of the paper's."""
-ADAPTED_PARTS = ("few_shot", "forgetting")
-"""Parts that compare adapted models with their start."""
-ADAPTED = " adapted"
-"""Ending of the name under which a variant's trainings stand that adaptations started from, where it has others as well."""
 SEEN = "seen"
 REFERENCE = "reference"
 """The row of the few-shot part that stands for the model before adaptation, on the robots that it was trained on."""
@@ -154,31 +165,11 @@ def find_variant(part: str, row: str) -> Variant:
     raise KeyError(f"no variant of the protocol fills the row {row!r} of {part!r}")
 
 
-def _list_adaptations() -> list[tuple[str, str]]:
-    """Names of all adapted variants, each with that of the variant that it starts from."""
-    variants = (variant for part in ADAPTED_PARTS for variant in variants_of(part))
-    return [(variant.name, variant.start.name) for variant in variants if variant.start is not None]
-
-
-def _adapted_trainings(trainings: Mapping[str, set[int]]) -> dict[str, set[int]]:
-    """By variant that adaptations start from: those of its trainings that one started from, where it has others as well."""
-    adapted: dict[str, set[int]] = {}
-    for variant, start in _list_adaptations():
-        adapted[start] = adapted.get(start, set()) | (trainings.get(variant, set()) & trainings.get(start, set()))
-    return {start: found for start, found in adapted.items() if found and found != trainings[start]}
-
-
-def _drawn_together(trainings: Mapping[str, set[int]]) -> dict[str, str]:
-    """By adapted variant, the name of its start's scores, where both have the same training runs.
-
-    An adaptation continues a training run, so both are drawn together and their difference is paired by run.
-    """
-    found = {}
-    for variant, start in _list_adaptations():
-        stands = start + ADAPTED if start + ADAPTED in trainings else start
-        if variant in trainings and trainings[variant] == trainings.get(stands):
-            found[variant] = stands
-    return found
+def _find_anchors(trainings: Mapping[str, Sequence[int]]) -> list[str]:
+    """Variants with several runs, whose spread those with one carry; adapted models only where there is no other."""
+    several = [name for name, seeds in trainings.items() if len(seeds) > 1]
+    first = [name for name in several if name not in VARIANTS or VARIANTS[name].target is None]
+    return first or several
 
 
 def pooled(variant: Variant, robots: str) -> tuple[str, ...]:
@@ -186,6 +177,10 @@ def pooled(variant: Variant, robots: str) -> tuple[str, ...]:
     if robots == BODIES:
         return UNSEEN_BODIES
     return SPLITS[variant.split].train_robots if robots == SEEN else (robots,)
+
+
+def _is_baseline(name: str) -> bool:
+    return name.partition(" ")[0] in BASELINES
 
 
 class StudyGrades:
@@ -198,6 +193,8 @@ class StudyGrades:
         own_distances: whether the distances were measured.
         draws: number of bootstrap draws.
         codecs: conditions of the truth through the codec of each variant, for noise floors.
+        assumed_spread: standard deviation between runs, as a share of a mean, where no variant has several; 0 for intervals of
+            these runs alone.
     """
 
     level = LEVEL
@@ -211,8 +208,9 @@ class StudyGrades:
         spreads: Mapping[str, np.ndarray] | None = None,
         draws: int = DRAWS,
         codecs: Mapping[str, Sequence[str]] | None = None,
+        assumed_spread: float = ASSUMED_SPREAD,
     ) -> None:
-        self.own_distances = own_distances
+        self.own_distances, self._assumed_spread = own_distances, assumed_spread
         self.metrics = {metric.name: metric for metric in metrics}
         self._axes, self._spreads, self._draws, self._codecs = axes, spreads or {}, draws, codecs or {}
         # Baselines belong to no variant; they are found by the model's name.
@@ -231,18 +229,11 @@ class StudyGrades:
         for i, (variant, robot, metric, training) in enumerate(names):
             self._columns[str(variant), str(robot), str(metric), int(training)] = i
             trainings.setdefault(str(variant), set()).add(int(training))
-        for start, adapted in _adapted_trainings(trainings).items():
-            trainings[start + ADAPTED] = adapted
-            own = [(key, i) for key, i in self._columns.items() if key[0] == start and key[-1] in adapted]
-            self._columns |= {(start + ADAPTED, *key[1:]): i for key, i in own}
         self._trainings = {variant: tuple(sorted(found)) for variant, found in trainings.items()}
-        self._drawn_with = _drawn_together(trainings)
-        self._several = [
-            (name, len(found))
-            for name, found in sorted(self._trainings.items())
-            if len(found) > 1 and name not in self._drawn_with
-        ]
+        self.anchors = _find_anchors(self._trainings)
+        """Names of the variants with several training runs that show the spread between runs."""
         self._cache: dict[tuple[str, tuple[str, ...], str, str], Mean | None] = {}
+        self._run_means: dict[tuple[tuple[str, ...], str], Mapping[str, Mapping[int, float]]] = {}
 
     @property
     def scenes(self) -> list[tuple[str, int]]:
@@ -252,7 +243,7 @@ class StudyGrades:
     @property
     def variants(self) -> list[str]:
         """Names of the variants that were graded, without the baselines."""
-        return [name for name in self._trainings if name.partition(" ")[0] not in BASELINES and not name.endswith(ADAPTED)]
+        return [name for name in self._trainings if not _is_baseline(name)]
 
     @property
     def notes(self) -> str:
@@ -271,12 +262,7 @@ class StudyGrades:
 
     def mean(self, part: str, row: str, robots: str, metric: str, shared: bool = False) -> Mean | None:
         variant = find_variant(part, row)
-        return self.variant_mean(self._name_in(part, variant), pooled(variant, robots), metric, part if shared else "")
-
-    def _name_in(self, part: str, variant: Variant) -> str:
-        """Name of a variant's scores in a part: an adapted model is compared with its own start, not with other trainings."""
-        adapted = variant.name + ADAPTED
-        return adapted if part in ADAPTED_PARTS and adapted in self._trainings else variant.name
+        return self.variant_mean(variant.name, pooled(variant, robots), metric, part if shared else "")
 
     def has(self, variant: str) -> bool:
         return variant in self._trainings
@@ -301,30 +287,23 @@ class StudyGrades:
                     np.where(self._shared(shared_part, robots, name), x, np.nan)
                     for x, name in zip(scores, metrics, strict=True)
                 ]
-            for name, mean in zip(metrics, self._bootstrap(variant, scores), strict=True):
+            for name, mean in zip(metrics, self._bootstrap(variant, robots, metrics, scores), strict=True):
                 self._cache[variant, robots, name, shared_part] = mean
         return self._cache[key]
 
     def difference(self, part: str, row: str, base: str, robots: str, metric: str) -> Mean | None:
-        after, before = (find_variant(part, key) for key in (row, base))
-        names = [self._name_in(part, variant) for variant in (after, before)]
-        if max(map(self.trainings, names)) > 1:
-            means = [self.mean(part, key, robots, metric, shared=True) for key in (row, base)]
-            return combine(np.subtract, *(mean for mean in means if mean)) if all(means) else None
-        shared = self._shared(part, pooled(after, robots), metric)
-        pools = [pooled(variant, robots) for variant in (after, before)]
-        new, old = (self._scores(name, pool, metric) for name, pool in zip(names, pools, strict=True))
-        return self._bootstrap(names[0], [np.where(shared, new - old, np.nan)])[0]
+        after, before = (self.mean(part, key, robots, metric, shared=True) for key in (row, base))
+        return None if after is None or before is None else combine(np.subtract, after, before)
 
     def against(self, part: str, row: str, baseline: str, robots: str, metric: str) -> tuple[Mean, Mean] | None:
         variant = find_variant(part, row)
         if not (self.has(variant.name) and self.has(baseline)):
             return None
-        names, pool = (self._name_in(part, variant), baseline), pooled(variant, robots)
+        names, pool = (variant.name, baseline), pooled(variant, robots)
         scores = [self._scores(name, pool, metric) for name in names]
         cells = self._shared(part, pool, metric) & ~np.isnan(scores[1]).all(axis=0)
         graded = zip(names, scores, strict=True)
-        mean, other = (self._bootstrap(name, [np.where(cells, own, np.nan)])[0] for name, own in graded)
+        mean, other = (self._bootstrap(name, pool, [metric], [np.where(cells, own, np.nan)])[0] for name, own in graded)
         return None if mean is None or other is None else (mean, other)
 
     def floor(self, robots: str, metric: str, *rows: tuple[str, str]) -> float:
@@ -340,29 +319,49 @@ class StudyGrades:
 
     def axis(self, name: str) -> np.ndarray:
         """Mean distances to the other four robots, the paper's or the study's own (`own_distances`): [5] float64, or where they
-        have a spread [1 + n + k 5], drawn from a normal distribution, in rows as those of `Mean.values`.
+        have a spread [1 + n 5], drawn from a normal distribution, in rows as those of `Mean.values`.
         """
         values, spread = self._axes[name], self._spreads.get(name, np.zeros(5))
         if not (spread > 0).any():
             return values
-        rows = 1 + self._draws + sum(count for _, count in self._several)
-        drawn = np.repeat(values[None], rows, axis=0)
+        drawn = np.repeat(values[None], 1 + self._draws, axis=0)
         rng = np.random.default_rng(list(name.encode()))
-        drawn[1 : 1 + self._draws] += spread * rng.standard_normal((self._draws, len(values)))
+        drawn[1:] += spread * rng.standard_normal((self._draws, len(values)))
         return drawn
 
-    def _bootstrap(self, variant: str, scores: Sequence[np.ndarray]) -> list[Mean | None]:
+    def _bootstrap(
+        self, variant: str, robots: tuple[str, ...], metrics: Sequence[str], scores: Sequence[np.ndarray]
+    ) -> list[Mean | None]:
         """The mean of each of some metrics' scores [k s r] of all trainings, scenes and some robots; None without any score."""
-        trainings, scenes, robots = scores[0].shape
-        columns = np.stack([x.reshape(trainings, scenes * robots) for x in scores], axis=-1)  # [k s*r m]
-        flat = columns.transpose(1, 2, 0).reshape(scenes * robots, -1)
-        found = list(bootstrap_means(flat, np.repeat(np.arange(scenes), robots), self._strata, self._draws))
-        means = []
-        for i in range(len(scores)):
-            own = [mean for mean in found[i * trainings : (i + 1) * trainings] if mean is not None]
-            mean = pool_trainings(own, self._drawn_with.get(variant, variant), self._several) if own else None
-            means.append(replace(mean, trainings=0) if mean and variant.partition(" ")[0] in BASELINES else mean)
+        trainings, scenes, count = scores[0].shape
+        columns = np.stack([x.reshape(trainings, scenes * count) for x in scores], axis=-1)  # [k s*r m]
+        flat = columns.transpose(1, 2, 0).reshape(scenes * count, -1)
+        found = list(bootstrap_means(flat, np.repeat(np.arange(scenes), count), self._strata, self._draws))
+        seeds = self._trainings.get(variant, (0,))
+        means: list[Mean | None] = []
+        for i, metric in enumerate(metrics):
+            own = zip(seeds, found[i * trainings : (i + 1) * trainings], strict=True)
+            known = {seed: mean for seed, mean in own if mean is not None}
+            means.append(self._pool(variant, robots, metric, known) if known else None)
         return means
+
+    def _pool(self, variant: str, robots: tuple[str, ...], metric: str, means: Mapping[int, Mean]) -> Mean:
+        """The mean of a variant over its runs, or of a baseline, from the mean of each by its training seed."""
+        info = self.metrics.get(metric)
+        mean = next(iter(means.values())) if _is_baseline(variant) else pool_runs(means, self._spread(variant, robots, metric))
+        return mean.within(info.range) if info else mean
+
+    def _spread(self, variant: str, robots: tuple[str, ...], metric: str) -> RunSpread:
+        """What the mean of a single run carries: the spread of the anchors' runs on the same robots."""
+        if (robots, metric) not in self._run_means:
+            self._run_means[robots, metric] = {name: self._means_of_runs(name, robots, metric) for name in self.anchors}
+        cell = f"{metric} of {' '.join(robots)}"
+        return find_spread(variant, cell, self._run_means[robots, metric], self._assumed_spread)
+
+    def _means_of_runs(self, variant: str, robots: tuple[str, ...], metric: str) -> Mapping[int, float]:
+        """The mean of each run of a variant that has any score, by its training seed."""
+        runs = zip(self._trainings[variant], self._scores(variant, robots, metric), strict=True)
+        return {seed: float(np.nanmean(own)) for seed, own in runs if not np.isnan(own).all()}
 
     def _scores(self, variant: str, robots: tuple[str, ...], metric: str) -> np.ndarray:
         """Scores [k s r] of all trainings and scenes, NaN where there is none; also where another of the trainings has none."""
@@ -413,7 +412,7 @@ class PaperGrades:
             return None
         if key not in self._cache:
             ends = self._rng.choice([-1.0, 1.0], DRAWS) * self._paper.half_digit_of(part, metric)
-            self._cache[key] = Mean(np.concatenate([[printed], printed + ends]), 0, None)
+            self._cache[key] = fixed_mean(np.concatenate([[printed], printed + ends]), 0, None)
         return self._cache[key]
 
     def difference(self, part: str, row: str, base: str, robots: str, metric: str) -> Mean | None:

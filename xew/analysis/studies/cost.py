@@ -5,7 +5,6 @@ done correct the estimates of their kind.
 """
 
 import heapq
-import json
 import math
 import shutil
 from collections.abc import Collection, Mapping
@@ -18,6 +17,7 @@ from xew.analysis.studies.ledger import Ledger
 from xew.analysis.studies.machines import TRAININGS, usable_gpus
 from xew.analysis.studies.plan import Step, measured_bodies, sort_steps
 from xew.config import merge_settings, parse, read_yaml
+from xew.files import read_json
 from xew.protocol import BASELINES, ROBOT_NAMES, Variant, training_counts
 
 RATES = Path(__file__).with_name("rates.json")
@@ -68,7 +68,7 @@ def find_size(study: Study) -> str:
 
 def find_rates(study: Study) -> Rates:
     """The rates of the size of the study's network; those of the small one where its size was not measured."""
-    measured, size = json.loads(RATES.read_text()), find_size(study)
+    measured, size = read_json(RATES), find_size(study)
     return parse(Rates, measured.get(size, measured["small"]), f"{RATES}, {size}")
 
 

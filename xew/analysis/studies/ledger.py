@@ -8,7 +8,6 @@ product counts as done if no step that is left needs it. Other steps run again, 
 
 import hashlib
 import json
-import shutil
 import socket
 import time
 from collections.abc import Callable, Mapping
@@ -20,7 +19,7 @@ from xew.analysis.studies.plan import Step, sort_steps, step_key
 from xew.config import ConfigError, parse
 from xew.dataset import find_accepted
 from xew.episode import EpisodeError
-from xew.files import file_digest, read_json, remove_written, replacing
+from xew.files import check_place, copy_file, file_digest, read_json, remove_written, write_text
 from xew.model.runs.layout import RUN_FILES, checkpoint_time, is_run, list_steps
 
 ROLLOUT_FILES = ("*/*/*/rgb.mkv", "*/*/*/rollout.json")
@@ -107,8 +106,7 @@ class Ledger:
         """Note what another ledger has noted of a step, with its log."""
         self._write(step, {name: value for name, value in other.record(step).items() if name != "at"})
         if other.log(step).is_file():
-            self.log(step).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copy2(other.log(step), self.log(step))
+            copy_file(other.log(step), self.log(step), within=self.out)
 
     def begin(self, step: Step) -> bool:
         """Note that a step starts; returns whether it resumes an earlier attempt.
@@ -116,6 +114,7 @@ class Ledger:
         Products of other inputs are removed if the command would resume them, and so are runs killed before their first
         checkpoint.
         """
+        self._check_places(step)
         key = self.key(step)
         goes_on = self.record(step).get("key") == key
         if step.kind in ("train", "adapt"):
@@ -143,9 +142,16 @@ class Ledger:
 
     def forget(self, step: Step) -> None:
         """Make a step run again; of grades, also remove what the command would resume (`scores/<variant>.*`)."""
+        self._check_places(step)
         self._path(step).unlink(missing_ok=True)
         if step.kind in ("baselines", "evaluate"):
             remove_written(step.product.parent, [f"{step.product.stem}.{ending}" for ending in GRADES])
+
+    def _check_places(self, step: Step) -> None:
+        """Raise OSError if links lead the record, the log or the product of a step out of the study's folder."""
+        for path in (self._path(step), self.log(step), step.product / "file"):
+            if path.is_relative_to(self.out):
+                check_place(path, within=self.out)
 
     def _path(self, step: Step) -> Path:
         return self.out / "state" / f"{step.name}.json"
@@ -153,8 +159,8 @@ class Ledger:
     def _write(self, step: Step, record: Mapping[str, Any]) -> None:
         path = self._path(step)
         try:
-            with replacing(path) as temporary:
-                temporary.write_text(json.dumps({**record, "at": time.strftime("%Y-%m-%d %H:%M:%S")}, indent=1) + "\n")
+            content = {**record, "at": time.strftime("%Y-%m-%d %H:%M:%S")}
+            write_text(path, json.dumps(content, indent=1) + "\n", within=self.out)
         except OSError as error:
             raise ConfigError(f"cannot write {path}: {error}. Free some space, or choose another --out.") from error
 
@@ -202,7 +208,8 @@ def _digest_rollouts(root: Path) -> str | None:
     files = sorted(path for path in root.glob("*/*/*/*") if path.is_file() and not path.parent.name.startswith("."))
     if not files:
         return None
-    return _digest([[str(f.relative_to(root)), f.stat().st_size, f.read_text() if f.suffix == ".json" else ""] for f in files])
+    texts = [f.read_text(encoding="utf-8", errors="replace") if f.suffix == ".json" else "" for f in files]
+    return _digest([[str(f.relative_to(root)), f.stat().st_size, text] for f, text in zip(files, texts, strict=True)])
 
 
 def _digest_file(path: Path) -> str | None:

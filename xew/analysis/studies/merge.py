@@ -4,13 +4,13 @@ A piece is a folder that `xew.analysis.study` wrote elsewhere; data, latents, ch
 never times, decide whether a record holds for this study.
 """
 
-import shutil
 from collections.abc import Mapping
 from pathlib import Path
 
 from xew.analysis.studies.ledger import Ledger, digest_product
 from xew.analysis.studies.plan import Step, sort_steps
 from xew.config import ConfigError
+from xew.files import copy_file, copy_tree
 
 SERVES_ALL = ("generate", "latents")
 """Kinds of steps whose products are not taken over: every machine has its own, and records tell whether they are the same."""
@@ -51,7 +51,7 @@ def _take_scores_by_video(data: Path, out: Path, piece: Path) -> None:
     if data.is_relative_to(out):
         scores = data.with_name(f"{data.name}-baselines").relative_to(out)
         if (piece / scores).is_dir():
-            shutil.copytree(piece / scores, out / scores, dirs_exist_ok=True)
+            copy_tree(piece / scores, out / scores, within=out)
 
 
 def _take_product(step: Step, out: Path, piece: Path, outcome: str) -> None:
@@ -63,9 +63,8 @@ def _take_product(step: Step, out: Path, piece: Path, outcome: str) -> None:
     if found not in (None, outcome):
         raise ConfigError(f"{source} is not what the records of {piece} say was made; bring the whole piece again.")
     if source.is_dir():
-        shutil.copytree(source, step.product, dirs_exist_ok=True, ignore=shutil.ignore_patterns(".*"))
+        copy_tree(source, step.product, within=out)
     name = "*" if step.kind == "distances" else f"{source.stem}.*"  # distances have their own folder
     siblings = [path for path in source.parent.glob(name) if path.is_file()]
     for path in {source, *siblings} if source.is_file() else ():
-        step.product.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copy2(path, step.product.parent / path.name)
+        copy_file(path, step.product.parent / path.name, within=out)

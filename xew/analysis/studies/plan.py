@@ -21,7 +21,7 @@ import yaml
 import xew
 from xew.analysis.studies.config import Settings, Study, build_experiment, run_folder
 from xew.episode import SCHEMA_VERSION
-from xew.files import file_digest, write_text
+from xew.files import file_digest, read_text, write_text
 from xew.protocol import DISTANCE_BODIES, GRADING_PROTOCOL, SHARED_MOTION, Variant
 
 
@@ -91,8 +91,8 @@ def write_configs(study: Study) -> dict[str, Path]:
     changed = {}
     for variant in study.planned_runs:
         path, text = _config_path(study, variant), yaml.safe_dump(build_experiment(study, variant), sort_keys=False)
-        if not path.exists() or path.read_text() != text:
-            write_text(path, text)
+        if not path.exists() or read_text(path) != text:
+            write_text(path, text, within=study.out)
             changed[variant.name] = path
     return changed
 

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Literal
 
 from xew.concurrency import leave_with_parent
+from xew.files import open_own
 
 PRELOADED = ("xew.model.train", "xew.model.rollout", "xew.metrics.evaluate")
 """Modules that the fork server imports. None of them may start a thread or a JAX backend at import, which no fork survives."""
@@ -63,7 +64,7 @@ def start_step(
 def last_lines(log: Path, count: int = 3) -> str:
     """The end of a command's log, without progress bars."""
     try:
-        text = log.read_text(errors="replace")
+        text = log.read_text(encoding="utf-8", errors="replace")
     except OSError:
         return ""
     lines = [line.rpartition("\r")[2].strip() for line in text.split("\n")]
@@ -76,7 +77,7 @@ def _run(command: tuple[str, ...], log: Path, environment: dict[str, str], launc
     os.nice(niceness)
     os.setpgrp()  # Ctrl-C reaches the study only, which asks its steps to stop
     leave_with_parent(lambda: os.kill(os.getpid(), signal.SIGTERM))
-    with log.open("a", buffering=1) as file, wait_for_lock(log.with_suffix(".lock")):
+    with open_own(log, "a") as file, wait_for_lock(log.with_suffix(".lock")):
         os.dup2(file.fileno(), 1)
         os.dup2(file.fileno(), 2)
         print("$", " ".join([*launcher, "python -m", *command]), flush=True)
@@ -119,6 +120,6 @@ def _launch(command: Sequence[str]) -> int:
 @contextlib.contextmanager
 def wait_for_lock(path: Path) -> Iterator[None]:
     """Wait until no other process holds this file's lock, and hold it until the block or the process ends."""
-    with path.open("w") as file:
+    with open_own(path, "a") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
         yield

@@ -15,7 +15,7 @@ from xew.analysis.statistics.grades import REFERENCE
 from xew.analysis.tables.comparisons import Claim, Comparison, NotMeasuredError, Reader
 from xew.analysis.tables.labels import PAPER_METRICS, SHORT_ROBOTS, SYSTEMS, spell_key
 from xew.protocol import FORGETTING_ROBOT, HELD_OUT_ROBOTS, ROBOT_NAMES, SHOTS
-from xew.statistics import Mean, combine
+from xew.statistics import combine, fixed_mean
 
 FRANKA, PIPER = HELD_OUT_ROBOTS
 PIXELS = ("ray_map", "mask", "optical_flow")
@@ -168,7 +168,7 @@ def _pair_differs_in_appearance(reader: Reader) -> Iterator[Comparison]:
     for axis, above, below in (("appearance", 1.5, np.inf), ("kinematic", 1 / 1.25, 1.25)):
         values = reader.grades.axis(axis)
         ratio = values[..., ROBOT_NAMES.index(FRANKA)] / values[..., ROBOT_NAMES.index(PIPER)]
-        number = Mean(np.resize(ratio, max(2, ratio.size)), 0, None)
+        number = fixed_mean(np.resize(ratio, max(2, ratio.size)), 0, None)
         yield Comparison(f"{axis}, Franka / Piper", number, above, below, percent=False)
 
 

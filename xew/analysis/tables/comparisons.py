@@ -182,6 +182,7 @@ class Reader:
         sign = -1 if self.grades.metrics[metric].higher_is_better else 1  # higher is worse
         distances = [self.grades.axis(axis) for axis in axes]
         number = combine(lambda *scores: statistic(*distances, sign * np.stack(scores, axis=-1)), *means)
+        number = number.within((-len(axes), len(axes)))  # of one r, or of the difference of two
         points = [np.atleast_2d(axis)[0] for axis in distances]
         scores = sign * np.array([mean.value for mean in means])
         p = exact_p(lambda paired: statistic(*points, paired), scores)

@@ -2,7 +2,8 @@
 
 Every comparison has two p-values, of the claim and of its opposite, corrected by Holm's method within the claim. A claim holds
 if all its comparisons hold, fails if one opposite is significant, and is unresolved otherwise or where there is a doubt (noise
-floor, no gap, five robots, few scenes). A second answer corrects for all claims. For printed figures p is 0 or 1.
+floor, no gap, five robots, few scenes). The answer that reports quote corrects for all claims too. For printed figures p is 0
+or 1.
 """
 
 from collections.abc import Sequence
@@ -55,7 +56,7 @@ class Finding:
     comparisons: tuple[AnsweredComparison, ...]
     missing: str = ""
     in_family: str = UNMEASURED
-    """Answer where all claims that were measured count as one family of tests."""
+    """Answer where all claims that were measured count as one family of tests: the one that reports quote."""
     over_pasting: tuple[AnsweredComparison, ...] = ()
     """Gains over the pasted render of the models of which the claim says something good; empty where there is none, or where
     the render was not graded."""

@@ -159,12 +159,12 @@ def findings_markdown(findings: Sequence[Finding], papers: Sequence[Finding] = (
     """A Markdown table of claims: test, both answers with numbers, and where given the answers by the paper's definitions and
     on the paper's own figures."""
     columns = _other_answers({"by the paper's definitions": by_paper, "the paper's own figures": papers}, len(findings))
-    heads = ["claim", "test", "verdict", "among all claims", "pasted render", "numbers", *columns[0]]
+    heads = ["claim", "test", "verdict", "asked alone", "pasted render", "numbers", *columns[0]]
     lines = [_markdown_line(heads), "|---" * len(heads) + "|"]
     for finding, last in zip(findings, columns[1:], strict=True):
         numbers = "; ".join(one.text for one in finding.comparisons) or f"missing: {finding.missing}"
         claim, basis = finding.claim, f" ({finding.basis})" if finding.basis else ""
-        cells = [f"{claim.says} ({claim.where})", claim.test, f"**{finding.answer}**{basis}", finding.in_family]
+        cells = [f"{claim.says} ({claim.where})", claim.test, f"**{finding.in_family}**{basis}", finding.answer]
         cells += [finding.pasting or "–", numbers, *last]
         lines.append(_markdown_line(cells))
     return "\n".join(lines)
@@ -173,7 +173,7 @@ def findings_markdown(findings: Sequence[Finding], papers: Sequence[Finding] = (
 def _other_answers(others: Mapping[str, Sequence[Finding]], count: int) -> list[list[str]]:
     """Heads, and then answers to each of so many claims, of other sources that are given."""
     given = {title: found for title, found in others.items() if found}
-    return [list(given), *([found[i].answer for found in given.values()] for i in range(count))]
+    return [list(given), *([found[i].in_family for found in given.values()] for i in range(count))]
 
 
 def findings_latex(findings: Sequence[Finding], papers: Sequence[Finding] = (), by_paper: Sequence[Finding] = ()) -> str:
@@ -190,7 +190,7 @@ def findings_latex(findings: Sequence[Finding], papers: Sequence[Finding] = (), 
             r"\centering\footnotesize",
             rf"\begin{{tabular}}{{@{{}}p{{0.32\textwidth}}p{{0.32\textwidth}}lll{'l' * len(columns[0])}@{{}}}}",
             r"\toprule",
-            _latex_line(["claim", "test", "verdict", "among all", "pasting", *columns[0]]),
+            _latex_line(["claim", "test", "verdict", "alone", "pasting", *columns[0]]),
             r"\midrule",
             *rows,
             r"\bottomrule",
@@ -204,11 +204,11 @@ def findings_latex(findings: Sequence[Finding], papers: Sequence[Finding] = (), 
 
 
 def _both_answers(finding: Finding) -> tuple[str, str, str]:
-    return finding.answer, finding.in_family, finding.pasting or "–"
+    return finding.in_family, finding.answer, finding.pasting or "–"
 
 
 def _findings_caption(findings: Sequence[Finding]) -> str:
     """Text that says what corrections are made, and whose results these are."""
     bases = ", ".join(dict.fromkeys(finding.basis for finding in findings if finding.basis))
-    text = "p-values are corrected by Holm's method for the comparisons of a claim, and once more for all claims."
+    text = "Verdicts are corrected by Holm's method for the comparisons of a claim and for all claims; alone, for its own only."
     return f"{text} Results rest on {bases}." if bases else text

@@ -4,7 +4,6 @@ PyTorch is imported on first use. Nothing is downloaded, and no file is unpickle
 """
 
 import importlib
-import pickle
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from xew.config import ConfigError
+from xew.metrics.networks.pickles import first_line, read_torch_file
 
 
 def import_package(module: str, user: str, install: str) -> ModuleType:
@@ -21,8 +21,7 @@ def import_package(module: str, user: str, install: str) -> ModuleType:
     try:
         return importlib.import_module(module)
     except (ImportError, RuntimeError) as error:  # torchvision beside a PyTorch of another build raises RuntimeError
-        reason = str(error).splitlines()[0]
-        raise ConfigError(f"{user} needs the package {module.partition('.')[0]} ({reason}); {install}.") from error
+        raise ConfigError(f"{user} needs the package {module.partition('.')[0]} ({first_line(error)}); {install}.") from error
 
 
 def import_torch(user: str) -> ModuleType:
@@ -37,10 +36,7 @@ def read_state_dict(path: Path, user: str) -> Mapping[str, Any]:
         ConfigError: PyTorch is absent, or the file is damaged or holds anything but tensors.
     """
     torch = import_torch(user)
-    try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
-    except (OSError, RuntimeError, EOFError, pickle.UnpicklingError, ValueError, KeyError) as error:
-        raise ConfigError(f"{path} is no whole checkpoint of {user} ({_first_line(error)}); download it again.") from error
+    content = read_torch_file(path, user)
     for wrapper in ("model", "state_dict"):
         if isinstance(content, Mapping) and isinstance(content.get(wrapper), Mapping):
             content = content[wrapper]
@@ -118,7 +114,3 @@ def check_tracks(prediction: np.ndarray, points: np.ndarray, visible: np.ndarray
             f"points are {points.shape}, visibility {visible.dtype} {visible.shape}, the video has {len(prediction)} frames; "
             "expected [t k 2] and bool [t k] of its frames."
         )
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0][:160]

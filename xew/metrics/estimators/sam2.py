@@ -16,6 +16,7 @@ from PIL import Image
 
 from xew.config import ConfigError
 from xew.metrics.estimators.adapters import import_package, import_torch, load_state_dict, read_state_dict, torch_device
+from xew.metrics.networks.pickles import first_line
 
 MEAN, DEVIATION = np.array([(0.485, 0.456, 0.406), (0.229, 0.224, 0.225)], np.float32)
 """Mean and standard deviation of ImageNet's colors in [0, 1], by which SAM 2 normalizes."""
@@ -184,9 +185,9 @@ def _read_folder(transformers: Any, folder: Path) -> Any:
         network, report = transformers.Sam2VideoModel.from_pretrained(
             str(folder), local_files_only=True, output_loading_info=True
         )
-    except (OSError, ValueError, RuntimeError, KeyError) as error:
+    except Exception as error:  # each library below it raises its own
         raise ConfigError(
-            f"{folder} cannot be read as a SAM 2 of Hugging Face ({str(error).splitlines()[0][:160]}); "
+            f"{folder} cannot be read as a SAM 2 of Hugging Face ({first_line(error)}); "
             "expected config.json and model.safetensors."
         ) from error
     lacking = sorted({*report["missing_keys"], *(key for key, *_ in report["mismatched_keys"])})

@@ -5,7 +5,6 @@ the tracks, at the frame where most are visible.
 """
 
 import functools
-import pickle
 from collections.abc import Mapping
 from pathlib import Path
 from typing import IO, Any
@@ -16,7 +15,7 @@ from PIL import Image
 
 from xew.config import ConfigError
 from xew.metrics.estimators.adapters import PointTracker, import_package
-from xew.metrics.networks.pickles import read_arrays
+from xew.metrics.networks.pickles import first_line, read_arrays
 
 SIDE = 256
 """Side [pixels] of the square for which the networks were trained."""
@@ -93,8 +92,8 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     try:
         with path.open("rb") as file:
             content = _read_object(file)
-    except (OSError, EOFError, ValueError, pickle.UnpicklingError, AttributeError, IndexError, KeyError, TypeError) as error:
-        raise ConfigError(f"{path} is no checkpoint of TAPIR ({error}); {expected}.") from error
+    except Exception as error:  # NumPy raises many types for damaged headers
+        raise ConfigError(f"{path} is no checkpoint of TAPIR ({first_line(error)}); {expected}.") from error
     if not isinstance(content, dict) or not all(isinstance(content.get(part), Mapping) for part in ("params", "state")):
         raise ConfigError(f"{path} lacks the parameters of TAPIR (`params`, `state`); {expected}.")
     return content

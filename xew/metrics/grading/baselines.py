@@ -13,7 +13,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from xew.episode import Record, read_record, read_video
+from xew.episode import Record, read_pixels, read_record
 from xew.metrics.truth import Truth
 from xew.protocol import COPY_FIRST_FRAME, GROUND_TRUTH, OTHER_ROBOT, PASTED_RENDER
 
@@ -43,7 +43,7 @@ def copy_first_frame(folder: Path, truth: Truth) -> np.ndarray:
 
 def pasted_render(folder: Path, truth: Truth) -> np.ndarray:
     """`paste_render` of an episode: uint8 [t h w 3]. No frame of the truth but the first is looked at."""
-    return paste_render(truth.rgb[0], read_video(folder / "robot.mkv")[: len(truth.rgb)])
+    return paste_render(truth.rgb[0], read_pixels(folder, "robot")[: len(truth.rgb)])
 
 
 def paste_render(first: np.ndarray, render: np.ndarray) -> np.ndarray:
@@ -75,7 +75,7 @@ def other_robot(folder: Path, truth: Truth) -> np.ndarray:
     """The true episode of the next robot by name in the same scene: uint8 [t h w 3]; a shorter one stands still at its end."""
     other = find_other_robot(folder)
     assert other is not None, "BASELINES asks before"
-    video = read_video(other / "rgb.mkv")
+    video = read_pixels(other, "rgb")
     return video[np.minimum(np.arange(len(truth.rgb)), len(video) - 1)]
 
 

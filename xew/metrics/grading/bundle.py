@@ -49,7 +49,7 @@ def write_bundle(path: Path, table: Path, rows: "pd.DataFrame", cells: Sequence[
     ]
     bundle: Bundle = {"format": FORMAT, "table": table.name, "table_sha256": digest_files([table])}
     bundle |= {str(name): value for name, value in rows.attrs.items()} | {"samples": samples, "means": means(samples)}
-    write_text(path, json.dumps(bundle | {"digest": digest(bundle)}, indent=1) + "\n")
+    write_text(path, json.dumps(bundle | {"digest": digest(bundle)}, indent=1) + "\n", within=path.parent)
 
 
 def read_bundle(path: Path) -> Bundle:
@@ -152,8 +152,8 @@ def disagreements(bundle: Bundle, key: tuple[Any, ...], values: dict[str, float]
 def raise_if_any(path: Path, differences: Sequence[str]) -> None:
     """Raise ConfigError with the first few differences, if there are any."""
     if differences:
-        more = f"\n  and {len(differences) - MOST_NAMED} more" if len(differences) > MOST_NAMED else ""
-        raise ConfigError(f"{path} does not hold here:\n  " + "\n  ".join(differences[:MOST_NAMED]) + more)
+        more = [f"and {len(differences) - MOST_NAMED} more"] if len(differences) > MOST_NAMED else []
+        raise ConfigError(f"{path} does not hold here:", *(f"  {text}" for text in [*differences[:MOST_NAMED], *more]))
 
 
 def means(samples: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:

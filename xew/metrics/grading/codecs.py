@@ -15,7 +15,7 @@ from typing import Protocol
 import numpy as np
 
 from xew.config import ConfigError
-from xew.episode import read_video
+from xew.episode import read_pixels
 
 OPENER = "xew.model.runs.roundtrip:open_roundtrip"
 """Function of a run's folder that opens its codec."""
@@ -55,7 +55,7 @@ class ModelCodec:
 
     def reconstruct(self, episode: Path, video: np.ndarray) -> np.ndarray:
         """What the codec leaves of an episode's video [t h w 3] uint8; in one thread at a time, since some take much memory."""
-        render = read_video(episode / "robot.mkv") if self.roundtrip.sees_render else None
+        render = read_pixels(episode, "robot") if self.roundtrip.sees_render else None
         with self._turn:
             return self.roundtrip(video, render)
 

@@ -4,8 +4,6 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import cv2
-import numpy as np
 from tqdm import tqdm
 
 from xew.concurrency import map_in_order
@@ -17,14 +15,9 @@ from xew.metrics.grading.baselines import BASELINES
 from xew.metrics.grading.codecs import ModelCodec, open_codecs
 from xew.metrics.grading.scores import Cell
 from xew.metrics.grading.settings import GradingSettings
-from xew.metrics.truth import Truth
 from xew.protocol import BASELINES as TITLES
-from xew.protocol import CODEC_TRUTH, GROUND_TRUTH, seed_split
-from xew.rollout import Rollout, RolloutError, find_rollouts, read_rollout_video, resize_video
-
-SOFTNESS = 0.8
-"""Standard deviation [pixels] of the blur through which estimators see the true video. Reference-aligned ones hardly err on the
-very video that they compare with; no prediction is ever that, and this is about as soft as a good codec leaves a video."""
+from xew.protocol import CODEC_TRUTH, seed_split
+from xew.rollout import Rollout, RolloutError, find_rollouts
 
 
 @dataclass(frozen=True)
@@ -100,6 +93,12 @@ def _list_rollout_jobs(
         except EpisodeError as error:
             return error
 
+    unbound = sum(rollout.header.get("source_hash") is None for rollout in rollouts)
+    if unbound:
+        print(
+            f"{unbound} of {len(rollouts)} rollouts do not say which video they predict (source_hash in rollout.json): they "
+            "are graded against the episodes that their folders name"
+        )
     jobs: dict[Cell, Job] = {}
     results = tqdm(map_in_order(try_jobs, rollouts), total=len(rollouts), desc="read", unit="video", disable=None, leave=False)
     for result in results:
@@ -215,41 +214,3 @@ def _raise_or_note(problems: list[str] | None, message: str) -> None:
     if problems is None:
         raise RolloutError(message)
     problems.append(message)
-
-
-def read_prediction(job: Job, truth: Truth, codecs: Mapping[str, ModelCodec], settings: GradingSettings) -> np.ndarray:
-    """The video to grade [t h w 3] uint8, of the truth's shape; `codecs` by the conditions of CODEC_TRUTH.
-
-    Raises:
-        RolloutError: the video cannot be read, or it has another shape and the settings do not allow that.
-    """
-    if job.rollout is None and job.cell.model == CODEC_TRUTH:
-        return codecs[job.cell.condition].reconstruct(job.episode, truth.rgb)
-    if job.rollout is None:
-        return BASELINES[job.cell.model].make(job.episode, truth)
-    allow = settings.args.allow
-    video = read_rollout_video(job.rollout, None if "rate" in allow else job.record.frame_rate)
-    if "resize" in allow:
-        video = resize_video(video, truth.rgb.shape[1:3])
-    if settings.args.frame_zero == "absent" and video.shape[1:] == truth.rgb.shape[1:]:
-        video = np.concatenate([truth.rgb[:1], video])
-    if "trim" in allow:
-        video = video[: len(truth.rgb)]
-    if video.shape != truth.rgb.shape:
-        raise RolloutError(
-            f"{job.rollout.video[0]} is {_size(video)}, expected {_size(truth.rgb)} as in the episode; say in rollout.json how "
-            'many frames were asked for ({"frame_count": n}), or allow what may be changed: --allow resize trim; a video '
-            "without the given frame: --frame-zero absent."
-        )
-    return video
-
-
-def soften_truth(job: Job, truth: Truth) -> np.ndarray | None:
-    """Blurred true video [t h w 3] uint8, which estimators see instead of the ground truth; None for other jobs."""
-    if job.rollout is not None or job.cell.model != GROUND_TRUTH:
-        return None
-    return np.stack([cv2.GaussianBlur(frame, (0, 0), SOFTNESS) for frame in truth.rgb])
-
-
-def _size(video: np.ndarray) -> str:
-    return f"{len(video)} frames of {video.shape[2]}x{video.shape[1]}"

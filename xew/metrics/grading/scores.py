@@ -90,10 +90,12 @@ class CellStore:
             stored = read_json(self._path(cell))
             if stored["content"] != cell.content:
                 return None
-            values = {name: math.nan if value is None else value for name, value in stored["values"].items()}
+            values = {name: math.nan if value is None else float(value) for name, value in stored["values"].items()}
             curves = {name: np.array(curve, np.float32) for name, curve in stored["curves"].items()}  # null becomes NaN
-            return Grades(values, curves, stored["exact_frames"])
-        except (OSError, ValueError, KeyError, TypeError, AttributeError):
+            exact_frames = int(stored["exact_frames"])
+            whole = all(curve.ndim == 1 and len(curve) <= cell.frames for curve in curves.values())
+            return Grades(values, curves, exact_frames) if whole and 0 <= exact_frames <= cell.frames else None
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError):
             return None
 
     def missing(self, cell: Cell, metrics: Iterable[str]) -> tuple[str, ...]:
@@ -112,7 +114,8 @@ class CellStore:
             "values": {name: _finite_or_none(value) for name, value in values.items()},
             "curves": {name: [_finite_or_none(value) for value in curve.tolist()] for name, curve in curves.items()},
         }
-        write_bytes(self._path(cell), json.dumps(content).encode())
+        root = self.baselines if cell.model in BASELINES else self.folder
+        write_bytes(self._path(cell), json.dumps(content).encode(), within=root.parent)
 
     def _path(self, cell: Cell) -> Path:
         if cell.model in BASELINES:
@@ -139,9 +142,9 @@ def surfaces_folder(data: Path, out: Path) -> Path:
 
 def folder_beside_data(data: Path, out: Path, name: str) -> Path:
     """Folder for what is made of a data set once, for all score tables: next to the data, or next to the table where that
-    cannot be written to."""
+    cannot be written to or is a link."""
     folder = data.absolute().with_name(f"{data.absolute().name}-{name}")
-    writable = os.access(folder if folder.exists() else folder.parent, os.W_OK)
+    writable = not folder.is_symlink() and os.access(folder if folder.exists() else folder.parent, os.W_OK)
     return folder if writable else path_beside(out, name)
 
 
@@ -198,7 +201,7 @@ def _repeat_key(cell: Cell, count: int) -> list[pa.Array]:
 
 
 def _write_parquet(path: Path, schema: pa.Schema, tables: Iterator[pa.Table]) -> None:
-    with replacing(path) as temporary, pq.ParquetWriter(temporary, schema) as writer:
+    with replacing(path, within=path.parent) as temporary, pq.ParquetWriter(temporary, schema) as writer:
         for group in _groups(tables, ROW_GROUP):
             writer.write_table(pa.concat_tables(group).replace_schema_metadata(schema.metadata))
 

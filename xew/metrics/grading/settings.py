@@ -42,13 +42,14 @@ class Args:
     frame_zero: Literal["given", "absent", "predicted"] = "given"
     """given: frame 0 of a video is the frame that the model was given, and is in no score. absent: videos begin with frame 1.
     predicted: frame 0 is scored like the others."""
-    allow: tuple[Literal["resize", "trim", "rate"], ...] = ()
-    """Changes to videos that are errors without it. resize: bring videos of another size to the episode's. trim: cut longer
-    videos. rate: take any frame rate of a container, its frames being the episode's one by one."""
+    allow: tuple[Literal["resize", "stretch", "trim", "rate"], ...] = ()
+    """Changes to videos that are errors without it. resize: bring videos of another size and the same aspect ratio to the
+    episode's. stretch: bring videos of any aspect ratio to it. trim: cut longer videos. rate: take any frame rate of a
+    container, its frames being the episode's one by one."""
     baselines: bool = True
     """Also grade, as separate models, the frozen first frame, the robot's render pasted into it, another robot's episode,
     and the true video itself: the noise floor of the scores."""
-    baselines_of: Literal["train", "validation", "test"] | None = None
+    baselines_of: Literal["train", "validation", "test", "final"] | None = None
     """Grade the baselines on all episodes of these seeds, without rollouts."""
     max_frames: int = 0
     """With --baselines-of: grade this number of frames; 0 for whole episodes."""

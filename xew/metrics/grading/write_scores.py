@@ -45,6 +45,6 @@ def _write_summary(out: Path, rows: pd.DataFrame, resample: str) -> str:
     texts = {"summary.md": to_markdown(summary)}
     texts |= {f"{name}.csv": csv_text(getattr(summary, table)) for name, table in TABLES.items()}
     for ending, text in texts.items():
-        write_text(path_beside(out, ending), text)
+        write_text(path_beside(out, ending), text, within=out.parent)
     written = "\n".join(f"{path_beside(out, ending)}  {what}" for ending, what in WRITTEN.items())
     return f"{to_markdown(summary, with_pairs=False)}\n{written}"

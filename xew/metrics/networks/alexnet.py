@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from xew.metrics.networks.pickles import read_arrays
+from xew.metrics.networks.pickles import read_arrays, read_torch_file
 
 ADMITTED = {("numpy.core.multiarray", "_reconstruct"), ("numpy", "ndarray"), ("numpy", "dtype")}
 """Module and name of all that the weight file may call."""
@@ -64,9 +64,7 @@ def _read_torch() -> Weights:
 
 def read_torch_alexnet(trunk: Path, heads: Path) -> Weights:
     """The same arrays as `read_alexnet` from torchvision's state dictionary and the heads as `lpips` holds them."""
-    import torch
-
-    layers, linear = (torch.load(path, map_location="cpu", weights_only=True) for path in (trunk, heads))
+    layers, linear = (read_torch_file(path, "LPIPS") for path in (trunk, heads))
     arrays = {}
     for i, layer in enumerate(TRUNK_LAYERS):
         arrays[f"conv{i}_kernel"] = layers[f"features.{layer}.weight"].numpy().transpose(2, 3, 1, 0).copy()

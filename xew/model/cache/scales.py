@@ -127,4 +127,4 @@ def keep_scales(encoding: Encoding, episodes: Sequence[Episode]) -> None:
     path, conditions = scales_path(encoding, episodes), encoding.inputs.conditions.values()
     if any(condition.scale != "none" for condition in conditions) and encoding.start_from is None and not path.exists():
         scales = fit_scales(conditions, (episode_command(folder, record) for folder, record in episodes))
-        write_text(path, dump_scales(scales))
+        write_text(path, dump_scales(scales), within=encoding.folder)

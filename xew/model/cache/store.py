@@ -53,13 +53,24 @@ class LatentCache:
         try:
             with safe_open(demand_regular(path), framework="np") as stored:
                 clips = stored.get_slice(CLIPS)
+                self._check_shape(record, stream, clips.get_shape())
                 return clips[min(clip, clips.get_shape()[0] - 1)]
         except FileNotFoundError:
             stale = list(path.parent.glob(f"{path.stem.rpartition('-')[0]}-*.safetensors"))
             fault = "was encoded from other data, with another codec or other clips" if stale else "is not in the cache"
             raise ConfigError(f"{path.parent}: the stream {stream} {fault}; {self.encoding.remedy}.") from None
-        except (OSError, SafetensorError) as error:
+        except (OSError, SafetensorError, ValueError) as error:
             raise ConfigError(f"{path} is damaged ({error}); delete it and {self.encoding.remedy}.") from error
+
+    def _check_shape(self, record: Record, stream: str, shape: list[int]) -> None:
+        """Raise ValueError unless a file of a stream has the clips of the episode and the shape of the network's input."""
+        condition, (frames, *frame) = self.streams[stream], self.encoding.inputs.shapes[stream]
+        if condition is None or condition.aligned:
+            expected = [len(self.starts(record)), frames, *frame]
+        else:  # one clip, whose number of frames is the condition's own
+            expected = [1, *shape[1:2], *frame]
+        if shape != expected:
+            raise ValueError(f"its shape is {shape}, expected {expected}")
 
     def write(self, record: Record, stream: str, clips: np.ndarray) -> int:
         """Write all clips of a stream atomically, and return their size in bytes.
@@ -73,7 +84,7 @@ class LatentCache:
         clips = clips.astype(np.float32 if clips.ndim == 3 else np.float16)
         path = self.path(record, stream)
         path_below(self.encoding.folder, *path.relative_to(self.encoding.folder).parts)
-        with replacing(path) as temporary:
+        with replacing(path, within=self.encoding.folder) as temporary:
             save_file({CLIPS: clips}, temporary)
         return clips.nbytes
 

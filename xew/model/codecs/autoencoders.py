@@ -87,9 +87,13 @@ class AutoencoderCodec(Codec):
     def save(self, folder: Path) -> None:
         """Write <file>.safetensors, unless it exists with the same hash, and <file>.json."""
         file = folder / f"{self.file}.json"
-        if not file.exists() or read_json(file)["hash"] != self.hash:
+        try:
+            same = read_json(file)["hash"] == self.hash
+        except (OSError, ValueError, KeyError, TypeError):  # there is none, or it is damaged
+            same = False
+        if not same:
             self.write_weights(file.with_suffix(".safetensors"))
-        write_text(file, json.dumps(self.describe() | {"hash": self.hash}, indent=1) + "\n")
+        write_text(file, json.dumps(self.describe() | {"hash": self.hash}, indent=1) + "\n", within=folder)
 
 
 @dataclass(frozen=True)

@@ -49,10 +49,10 @@ class GivenFrames(NamedTuple):
     They come from the commands and the first frame alone, so no decoder can show the future.
     """
 
-    render: UInt8[Array, "b t2 h w 3"]
-    """The commanded robot on white, from one frame before the first to one after the last: [b t+2 h w 3]."""
-    first: UInt8[Array, "b 1 h w 3"]
-    """First frame of the episode: [b 1 h w 3]."""
+    render: Any
+    """[b t+2 h w 3] uint8, the commanded robot on white, from one frame before the first to one after the last."""
+    first: Any
+    """[b 1 h w 3] uint8, first frame of the episode."""
 
 
 class LatentSize(NamedTuple):

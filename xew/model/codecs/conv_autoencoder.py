@@ -15,7 +15,7 @@ import itertools
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -29,16 +29,13 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
 from xew.config import ConfigError, parse
-from xew.files import demand_regular, replacing
+from xew.files import demand_regular, parse_json, replacing
 from xew.model.codecs.vae import LatentStatistic
 from xew.model.codecs.vae_layers import Conv, Layers, RmsNorm, as_row, check_frames, patchify, unpatchify
 from xew.model.video.frames import TEMPORAL_FACTOR
 from xew.model.weights.filling import fill
 from xew.model.weights.layout import Source, module_leaves
 from xew.model.weights.reading import read_tensors
-
-if TYPE_CHECKING:
-    from xew.model.codecs.render_head import RenderHead
 
 T = TypeVar("T")
 Groups = Float[Array, "n 4 h w 3"]
@@ -221,8 +218,8 @@ def abstract_autoencoder(size: AutoencoderSize, dtype: DTypeLike = jnp.float32) 
     return nnx.eval_shape(lambda: ConvAutoencoder(size, dtype=dtype, rngs=nnx.Rngs(0)))
 
 
-def save_weights(module: "ConvAutoencoder | RenderHead", path: Path) -> None:
-    """Write an autoencoder or a render head, and its size, as .safetensors: kernels in bfloat16, the rest in float32.
+def save_weights(module: Any, path: Path) -> None:
+    """Write a module and its `size`, a dataclass, as .safetensors: kernels in bfloat16, the rest in float32.
 
     Raises:
         ConfigError: the file cannot be written.
@@ -232,7 +229,7 @@ def save_weights(module: "ConvAutoencoder | RenderHead", path: Path) -> None:
         value = np.asarray(jax.device_get(variable.get_value()))
         tensors[name] = value.astype(ml_dtypes.bfloat16) if name.endswith(".kernel") else value
     try:
-        with replacing(path) as partial:
+        with replacing(path, within=path.parent) as partial:
             save_file(tensors, partial, metadata={SIZE: json.dumps(asdict(module.size))})
             partial.chmod(0o644)
     except (OSError, SafetensorError) as error:
@@ -250,7 +247,7 @@ def load_autoencoder(path: Path, dtype: DTypeLike = jnp.float32) -> ConvAutoenco
     return autoencoder
 
 
-def fill_leaves(module: "ConvAutoencoder | RenderHead", file: Path) -> None:
+def fill_leaves(module: nnx.Module, file: Path) -> None:
     """Fill a module in place from a file that `save_weights` wrote. Raises ConfigError if it does not fit."""
     fill(module, read_tensors(file), {name: Source((name,)) for name in module_leaves(module, {})})
 
@@ -277,7 +274,11 @@ def read_stored_size(kind: type[T], file: Path, changed: int) -> T:
         raise ConfigError(f"{file} is not a whole safetensors file ({error}); copy it again.") from error
     if SIZE not in metadata:
         raise ConfigError(f"{file} does not hold the size of its network; expected weights that xew wrote.")
-    return parse(kind, json.loads(metadata[SIZE]), str(file))
+    try:
+        size = parse_json(metadata[SIZE])
+    except (ValueError, RecursionError) as error:
+        raise ConfigError(f"{file} is damaged: the size of its network is no JSON ({error}); copy it again.") from error
+    return parse(kind, size, str(file))
 
 
 def find_weights(path: Path) -> Path:
@@ -288,7 +289,7 @@ def find_weights(path: Path) -> Path:
     """
     if not path.is_dir():
         return path
-    files = sorted(file for file in path.glob("*.safetensors") if file.name != HEAD_FILE)
+    files = sorted(file for file in path.glob("[!.]*.safetensors") if file.name != HEAD_FILE)
     if len(files) != 1:
         names = ", ".join(file.name for file in files) or "no .safetensors"
         raise ConfigError(f"{path} holds {names}; expected the path of one file of weights.")

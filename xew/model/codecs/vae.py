@@ -11,7 +11,6 @@ Source: Wan2.2 (github.com/Wan-Video/Wan2.2, vae2_2.py, Apache-2.0).
 Shape letters: b batch, t h w c video, i o channels in and out.
 """
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,6 +21,7 @@ from jax.typing import DTypeLike
 from jaxtyping import Float
 
 from xew.config import ConfigError
+from xew.files import read_json
 from xew.model.codecs.vae_chunks import History, apply_in_chunks, even_chunk
 from xew.model.codecs.vae_layers import (
     Downsample,
@@ -181,7 +181,7 @@ def initial_statistics(size: VaeSize) -> tuple[Float[Array, " c"], Float[Array, 
     """Mean and standard deviation of the latents [c]: Wan2.2's published ones at its size, else 0 and 1."""
     if size != VAES["wan22"]:
         return jnp.zeros(size.channels), jnp.ones(size.channels)
-    published = json.loads(PUBLISHED_STATISTICS.read_text())
+    published = read_json(PUBLISHED_STATISTICS)
     return jnp.asarray(published["mean"], jnp.float32), jnp.asarray(published["std"], jnp.float32)
 
 

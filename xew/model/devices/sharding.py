@@ -7,6 +7,8 @@ sharded along `fsdp`; each layer is gathered when it is computed. Results depend
 import functools
 import math
 import os
+import sys
+import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -23,6 +25,14 @@ AXES = ("data", "fsdp")
 """Names of the mesh's axes."""
 SMALL = 2**14
 """Size of an array (of one layer) below which it is copied to every device instead of sharded."""
+TASK_COUNTS = ("SLURM_STEP_NUM_TASKS", "OMPI_COMM_WORLD_SIZE")
+"""Variables in which launchers give the number of processes."""
+NOTICE_S, JOIN_S = 5, 300
+"""Times until a process says that it waits for others, and until it ends without them [s]."""
+LAUNCH = (
+    "Start all by Slurm's srun or Open MPI's mpirun, or set JAX_COORDINATOR_ADDRESS=host:port, JAX_NUM_PROCESSES and "
+    "JAX_PROCESS_ID in each; JAX_NUM_PROCESSES=1 runs this process alone."
+)
 LAYERS = "blocks"
 """Name of the subtree whose arrays have a leading axis of layers, which is never sharded."""
 
@@ -41,24 +51,57 @@ def start_processes(force: bool = False, environment: Mapping[str, str] = os.env
     """Join the other processes of this run if `force` is true or a launcher has started several.
 
     A launcher sets JAX_COORDINATOR_ADDRESS, JAX_NUM_PROCESSES and JAX_PROCESS_ID, or Slurm's or Open MPI's variables for more
-    than one task.
+    than one task. JAX_NUM_PROCESSES=1 runs a process alone. If the others do not come, the process ends after JOIN_S.
 
     Raises:
-        ConfigError: the variables contradict each other, or the other processes cannot be reached.
+        ConfigError: the variables are invalid or contradict each other, or the other processes cannot be reached.
     """
-    tasks = max(int(environment.get(name, 1)) for name in ("SLURM_STEP_NUM_TASKS", "OMPI_COMM_WORLD_SIZE"))
     coordinator = environment.get("JAX_COORDINATOR_ADDRESS")
-    if not (force or coordinator or tasks > 1):
+    named = {"num_processes": "JAX_NUM_PROCESSES", "process_id": "JAX_PROCESS_ID"}
+    numbers: dict[str, Any] = {key: _number(environment, name) for key, name in named.items() if name in environment}
+    tasks = max(_number(environment, name) for name in TASK_COUNTS)
+    count = numbers.get("num_processes", tasks)
+    is_alone = count == 1 and ("num_processes" in numbers or not coordinator)
+    if is_alone and not force:
         return
+    _check_launch(coordinator, count, environment)
+    joined = threading.Event()
+    threading.Thread(target=_watch, args=(joined, count - 1), daemon=True).start()
     try:
-        named = {"num_processes": "JAX_NUM_PROCESSES", "process_id": "JAX_PROCESS_ID"}
-        numbers: dict[str, Any] = {key: int(environment[name]) for key, name in named.items() if name in environment}
-        jax.distributed.initialize(coordinator, **numbers)
-    except (ValueError, RuntimeError) as error:
-        raise ConfigError(
-            f"cannot join the other processes: {error}. Set JAX_COORDINATOR_ADDRESS=host:port, JAX_NUM_PROCESSES and "
-            "JAX_PROCESS_ID in each, or start them with Slurm's srun or Open MPI's mpirun."
-        ) from error
+        jax.distributed.initialize(coordinator, **numbers, initialization_timeout=2 * JOIN_S)
+    except Exception as error:  # JAX's readers of launchers' variables raise KeyError, IndexError and others
+        raise ConfigError(f"cannot join the other processes: {str(error).rstrip('.')}. {LAUNCH}") from error
+    finally:
+        joined.set()
+
+
+def _number(environment: Mapping[str, str], name: str) -> int:
+    """The whole number in a launcher's variable, 1 without it."""
+    try:
+        return int(environment.get(name, 1))
+    except ValueError as error:
+        raise ConfigError(f"{name} is {environment[name]!r}, expected a whole number. {LAUNCH}") from error
+
+
+def _check_launch(coordinator: str | None, count: int, environment: Mapping[str, str]) -> None:
+    """Raise ConfigError if the coordinator has no port, or if this is one process of an interactive shell in a Slurm step."""
+    if coordinator is not None:
+        host, _, port = coordinator.rpartition(":")
+        if not host or not port.isdecimal():
+            raise ConfigError(f"JAX_COORDINATOR_ADDRESS is {coordinator!r}, expected host:port, such as {coordinator}:12355.")
+    elif "SLURM_PTY_PORT" in environment:
+        raise ConfigError(f"this is a shell of a Slurm step of {count} tasks, where only one process was started. {LAUNCH}")
+
+
+def _watch(joined: threading.Event, others: int) -> None:
+    """Say that this process waits for others, and end it after JOIN_S, when JAX would abort without an explanation."""
+    if joined.wait(NOTICE_S):
+        return
+    missing = f"{others} other process{'es' if others > 1 else ''} of this run" if others > 0 else "the other processes"
+    print(f"waiting up to {JOIN_S} s for {missing}. {LAUNCH}", file=sys.stderr, flush=True)
+    if not joined.wait(JOIN_S - NOTICE_S):
+        print(f"error: {missing} did not come within {JOIN_S} s. {LAUNCH}", file=sys.stderr, flush=True)
+        os._exit(2)
 
 
 def mesh_shape(settings: MeshSettings, devices: int) -> tuple[int, int]:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from xew.config import ConfigError, suggestion
-from xew.dataset import Dataset, Episode, demand_one_motion, read_dataset
+from xew.dataset import Dataset, Episode, demand_one_motion, demand_one_rate, read_dataset
 from xew.episode import EpisodeError
 from xew.model.settings.parts import EpisodeChoice
 from xew.protocol import expand_robots
@@ -27,16 +27,12 @@ def choose_episodes(dataset: Dataset, choice: EpisodeChoice) -> TrainingEpisodes
     """Choose all episodes of a training run.
 
     Raises:
-        ConfigError, EpisodeError: there are no or too few training episodes, or an episode of a sample has no video.
+        ConfigError, EpisodeError: there are no or too few training episodes, or they have several frame rates.
     """
     samples = sample_episodes(dataset, choice.samples, choice.motion)
-    bare = [folder for folder, record in samples.values() if not record.videos]
-    if bare:
-        raise ConfigError(
-            f"{bare[0]} was made with --states-only and has no video for samples; disable samples with "
-            f"--train.sample-every 0, or make videos: python -m xew.sim_warp.inspect {dataset.root} --render"
-        )
-    return TrainingEpisodes(training_episodes(dataset, choice), replay_episodes(dataset, choice), samples)
+    fresh, replay = training_episodes(dataset, choice), replay_episodes(dataset, choice)
+    demand_one_rate(dataset.root, (record for _, record in (*fresh, *replay)))
+    return TrainingEpisodes(fresh, replay, samples)
 
 
 def training_episodes(dataset: Dataset, choice: EpisodeChoice) -> list[Episode]:
@@ -79,10 +75,10 @@ def first_of_each(episodes: Sequence[Episode], count: int) -> list[Episode]:
 
 
 def sample_episodes(dataset: Dataset, roles: Mapping[str, str], motion: str | None = None) -> dict[str, Episode]:
-    """An episode of each of these robots in the data, by role and robot: of a validation seed, else of a training seed."""
+    """An episode with videos of each of these robots, by role and robot: of a validation seed, else of a training seed."""
     robots = tuple(roles)
     candidates = [e for family in ("validation", "train") for e in dataset.select(robots=robots, split=family, motion=motion)]
-    first = {record.robot: (folder, record) for folder, record in reversed(candidates)}
+    first = {record.robot: (folder, record) for folder, record in reversed(candidates) if record.videos}
     return {f"{roles[robot]}/{robot}": first[robot] for robot in roles if robot in first}
 
 

@@ -19,4 +19,4 @@ def episode_command(
         rendered: [t 240 320 3] uint8, the robot alone, if in memory; otherwise its video is read when needed.
         scene: [t 240 320 3] uint8, the episode's video, if in memory; conditions see its first frame alone.
     """
-    return make_command(folder, record, read_states(folder), rendered, scene)
+    return make_command(folder, record, read_states(folder, record), rendered, scene)

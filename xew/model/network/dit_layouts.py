@@ -182,7 +182,7 @@ def save_dit(model: WorldModel, path: Path, naming: Naming = "diffusers") -> Non
     """
     save_weights(model, path, dit_layout(model, naming))
     if naming == "diffusers" and Path(path).suffix != ".safetensors":
-        write_text(Path(path) / "config.json", json.dumps(diffusers_config(model), indent=2))
+        write_text(Path(path) / "config.json", json.dumps(diffusers_config(model), indent=2), within=Path(path))
 
 
 def diffusers_config(model: WorldModel) -> dict[str, Any]:

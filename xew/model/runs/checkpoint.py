@@ -27,6 +27,7 @@ from xew.model.network.lora import apply_lora, init_lora
 from xew.model.network.spec import Network
 from xew.model.runs.folder import KeptStep, trace_run
 from xew.model.runs.layout import list_steps
+from xew.names import demand_utf8
 
 SUMMING = ThreadPoolExecutor(1, "sums")
 """Thread that computes checksums of earlier checkpoints during training."""
@@ -49,6 +50,7 @@ class TrainState:
 
 def open_checkpoints(out: Path, keep: int = 1) -> ocp.CheckpointManager:
     """Open the checkpoints of a run, written in the background."""
+    demand_utf8(out.absolute())
     options = ocp.CheckpointManagerOptions(max_to_keep=keep, enable_async_checkpointing=True)
     return ocp.CheckpointManager((out / "checkpoints").absolute(), options=options)
 
@@ -198,11 +200,13 @@ def note_sums(out: Path) -> None:
             sums = {
                 file.relative_to(folder).as_posix(): file_digest(file) for file in sorted(folder.rglob("*")) if file.is_file()
             }
-            write_text(path, json.dumps(sums, indent=1, sort_keys=True) + "\n")
+            write_text(path, json.dumps(sums, indent=1, sort_keys=True) + "\n", within=out)
         except OSError:  # the checkpoint is being replaced, or the disk is full: it is then read without sums
             continue
+    if (out / "sums").is_symlink():
+        return
     for path in (out / "sums").glob("*.json"):
-        if path.stem not in map(str, steps):
+        if path.stem.isdecimal() and int(path.stem) not in steps:
             path.unlink(missing_ok=True)
 
 

@@ -3,6 +3,7 @@
 <out>/config.yaml       the resolved config, itself a valid input
 <out>/codec/            the codec that the latents were made with
 <out>/scales.json       normalization of numeric conditions, if there are any
+<out>/episodes.json     digests of the training episodes
 <out>/sums/STEP.json    checksums of a checkpoint's files
 <out>/.xew-run          mark of a run, without which no file is replaced
 <out>/checkpoints/STEP  params, optimizer, position of the data, and ema if there is one
@@ -11,8 +12,9 @@
 """
 
 import dataclasses
+import hashlib
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -23,7 +25,8 @@ from jax.experimental import multihost_utils
 
 from xew import config
 from xew.config import ConfigError
-from xew.files import read_json, remove_written, write_text
+from xew.dataset import Episode
+from xew.files import demand_no_links, read_json, remove_written, write_text
 from xew.model.cache.keys import RUN_SCALES
 from xew.model.cache.scales import Scale, dump_scales, load_run_scales
 from xew.model.codecs.codec import RUN_CODEC, RUN_REMEDY, codec_class, load_kept_codec
@@ -37,6 +40,8 @@ from xew.model.weights.reading import read_tensors
 
 T = TypeVar("T")
 
+EPISODES = "episodes.json"
+"""Name of the file in a run with the digests of its training episodes."""
 START = "start.json"
 """Name of the file in an adapted run with the checkpoint that it started from."""
 FREE_TO_CHANGE = (
@@ -53,7 +58,7 @@ FREE_TO_CHANGE = (
     "train.steps",
     "train.log_every",
     "train.save_every",
-    "train.sample_every",
+    "train.samples",
     "train.keep_checkpoints",
     "pictures.device_share",
     "pictures.host_gb",
@@ -64,11 +69,25 @@ FREE_TO_CHANGE = (
 
 
 def begin_run(
-    experiment: Experiment, codec: Codec, scales: Mapping[str, Scale], *, resume: bool, overwrite: bool
+    experiment: Experiment,
+    codec: Codec,
+    scales: Mapping[str, Scale],
+    episodes: Iterable[Episode],
+    *,
+    resume: bool,
+    overwrite: bool,
 ) -> dict[str, Scale]:
-    """Prepare the run folder in the first process, as `prepare_run`, and return the run's scales."""
+    """Prepare the folder of a run on these episodes in the first process, as `prepare_run`, and return the run's scales.
+
+    Raises:
+        ConfigError: as `prepare_run` and `check_episodes`.
+    """
     if jax.process_index() == 0:
+        episodes = list(episodes)
+        if resume:
+            check_episodes(experiment.out, episodes)
         prepare_run(experiment, codec, scales, resume=resume, overwrite=overwrite)
+        write_episodes(experiment.out, episodes)
     if jax.process_count() > 1:
         multihost_utils.sync_global_devices("run folder")
     return load_run_scales(experiment.conditions, experiment.out)
@@ -102,9 +121,47 @@ def prepare_run(experiment: Experiment, codec: Codec, scales: Mapping[str, Scale
         raise ConfigError(f"cannot write the run {out}: {error}; choose another --out.") from error
     if start is not None and steps:
         note = StartNote(str(start), max(steps), checkpoint_time(start, max(steps)))
-        write_text(out / START, json.dumps(dataclasses.asdict(note), indent=1) + "\n")
+        write_text(out / START, json.dumps(dataclasses.asdict(note), indent=1) + "\n", within=out)
     if scales and not (out / RUN_SCALES).exists():
-        write_text(out / RUN_SCALES, dump_scales(scales))
+        write_text(out / RUN_SCALES, dump_scales(scales), within=out)
+
+
+def check_episodes(out: Path, episodes: Iterable[Episode]) -> None:
+    """Raise ConfigError if a run was begun with other training episodes. Runs of earlier versions do not name theirs."""
+    path, present = out / EPISODES, _digest_episodes(episodes)
+    if not path.exists():
+        return
+    try:
+        begun = config.CONVERTER.structure(read_json(path), dict[str, str])
+    except Exception as error:  # cattrs has many types
+        raise ConfigError(f"{path} is damaged ({error}); copy the run again, or train it again with --overwrite.") from error
+    groups = {
+        "missing": begun.keys() - present.keys(),
+        "new": present.keys() - begun.keys(),
+        "of other content": {name for name in begun.keys() & present.keys() if begun[name] != present[name]},
+    }
+    if any(groups.values()):
+        listed = ", ".join(f"{len(names)} {what} (such as {min(names)})" for what, names in groups.items() if names)
+        raise ConfigError(
+            f"{out} was begun with {len(begun)} episodes, and --data has others: {listed}. Resume with the same data, use "
+            "--overwrite, or choose another --out."
+        )
+
+
+def write_episodes(out: Path, episodes: Iterable[Episode]) -> None:
+    """Write the digests of a run's training episodes, unless it has them."""
+    if not (out / EPISODES).exists():
+        write_text(out / EPISODES, json.dumps(_digest_episodes(episodes), indent=1) + "\n", within=out)
+
+
+def _digest_episodes(episodes: Iterable[Episode]) -> dict[str, str]:
+    """Digests of what training reads of episodes, by task, seed and robot."""
+    digests = {}
+    for _, record in episodes:
+        content = json.dumps([record.instruction, sorted(record.hashes.items())])
+        name = f"{record.task}/{record.seed}/{record.robot}"
+        digests[name] = hashlib.sha256(content.encode()).hexdigest()[:16]
+    return digests
 
 
 def check_one_of(resume: bool, overwrite: bool) -> None:
@@ -120,10 +177,16 @@ def claim_run(out: Path, settings: T, read: Callable[[Path], T], *, resume: bool
 
 
 def check_claim(out: Path, settings: T, read: Callable[[Path], T], *, resume: bool, overwrite: bool) -> None:
-    """Raise ConfigError if a folder holds other files, a run without either flag, or a run to resume with another config."""
+    """Check that a folder may become a run's.
+
+    Raises:
+        ConfigError: it holds other files, a run without either flag, or a run to resume with another config.
+        OSError: it holds a link.
+    """
     saved = out / "config.yaml"
     if out.exists() and not out.is_dir():
         raise ConfigError(f"{out} is a file; choose another --out.")
+    demand_no_links(out)
     if saved.exists() and resume:
         _check_same(read(saved), settings, out)
     elif saved.exists() and not overwrite:
@@ -145,9 +208,10 @@ def _find_codec(experiment: Experiment, out: Path) -> Codec | None:
 
 
 def _is_bare(out: Path) -> bool:
-    """Whether a folder is empty, or holds only the mark of a run that was killed before its config was written."""
+    """Whether a folder is empty, or holds only the mark, perhaps half written, of a run that was killed before its config."""
     names = [path.name for path in out.iterdir()]
-    return not names or (RUN_MARK in names and all(name.startswith(".") for name in names))
+    marked = any(name == RUN_MARK or name.startswith(f".{RUN_MARK}.") for name in names)
+    return not names or (marked and all(name.startswith(".") for name in names))
 
 
 def write_claim(out: Path, settings: Any, *, overwrite: bool) -> None:
@@ -156,8 +220,7 @@ def write_claim(out: Path, settings: Any, *, overwrite: bool) -> None:
     if overwrite and saved.exists():
         _remove_run(out)
     try:
-        out.mkdir(parents=True, exist_ok=True)
-        (out / RUN_MARK).touch()
+        write_text(out / RUN_MARK, "", within=out)
         config.save(settings, saved)
     except OSError as error:
         raise ConfigError(f"cannot write the run {out}: {error}; choose another --out.") from error
@@ -183,6 +246,7 @@ def check_start(experiment: Experiment) -> None:
         raise ConfigError(f"out is {experiment.out}, the run that adapt.start_from names; choose another --out.")
     if run is not None:
         _check_same_network(load_run_config(run), experiment, run)
+        trace_run(run)
     if weights is not None:
         check_dit(nnx.eval_shape(lambda: WorldModel(experiment.network)), read_tensors(weights))
 
@@ -249,7 +313,8 @@ def trace_run(out: Path, step: int | None = None) -> list[KeptStep]:
     """The lineage of checkpoints whose sum is a run's network: a whole network, then LoRA corrections, the run's own last.
 
     Raises:
-        ConfigError: a run that it was adapted from is missing or was trained again, or start.json is missing.
+        ConfigError: a run that it was adapted from is missing or was trained again, start.json is missing, or the runs refer to
+            one another in a circle.
     """
     own = KeptStep(out, step, load_run_config(out).adapt)
     return [*trace_start(out, own.adapt.start_from), own] if own.adapt.lora_rank else [own]
@@ -258,7 +323,11 @@ def trace_run(out: Path, step: int | None = None) -> list[KeptStep]:
 def trace_start(out: Path, run: Path | None) -> list[KeptStep]:
     """The lineage of checkpoints of `run` from which the adapted run `out` started. Raises ConfigError as `trace_run`."""
     lineage: list[KeptStep] = []
+    traced = {out.resolve()}
     while run is not None:
+        if run.resolve() in traced:
+            raise ConfigError(f"{run} was adapted from itself, perhaps over other runs; copy the whole runs again.")
+        traced.add(run.resolve())
         lineage.insert(0, _read_start(out, run))
         out, adapt = run, lineage[0].adapt
         run = adapt.start_from if adapt.lora_rank else None

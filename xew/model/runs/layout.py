@@ -11,6 +11,7 @@ RUN_FILES = (
     "config.yaml",
     "codec/*",
     "scales.json",
+    "episodes.json",
     "checkpoints/*",
     "sums/*.json",
     "start.json",

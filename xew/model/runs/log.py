@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from PIL import Image
 from tensorboard.compat.proto.event_pb2 import Event, SessionLog
 from tensorboard.compat.proto.summary_pb2 import Summary
@@ -21,9 +20,8 @@ from tensorboard.plugins.hparams.summary_v2 import hparams_pb
 from tensorboard.plugins.text.summary_v2 import text_pb
 from tensorboard.summary.writer.event_file_writer import EventFileWriter
 
-from xew.files import demand_regular, write_text
-
-FRAME_MILLISECONDS = 120
+from xew.config import parse_yaml
+from xew.files import demand_regular, open_own, read_text, write_text
 
 
 class RunLog:
@@ -32,29 +30,30 @@ class RunLog:
     Args:
         folder: of the run.
         step: at which the run continues; log lines of later steps are removed.
+        recommended: config whose settings are left out of HParams.
     """
 
-    def __init__(self, folder: Path, step: int) -> None:
+    def __init__(self, folder: Path, step: int, recommended: Any = None) -> None:
         path, config = folder / "metrics.jsonl", folder / "config.yaml"
-        before = demand_regular(path).read_text(errors="replace") if path.exists() else None
-        settings = demand_regular(config).read_text() if config.exists() else None
+        before = demand_regular(path).read_text(encoding="utf-8", errors="replace") if path.exists() else None
+        settings = read_text(config) if config.exists() else None
         self.events = EventFileWriter(str(folder))
         if before is not None:
             self.events.add_event(Event(wall_time=time.time(), step=step + 1, session_log=SessionLog(status=SessionLog.START)))
         if settings is not None:
-            self._settings(step, settings)
-        if before is not None and (earlier := _lines_until(before, step)) != before:
-            write_text(path, earlier)
-        self.lines = path.open("a")
+            self._settings(step, settings, flatten_settings(recommended))
+        write_text(path, _lines_until(before or "", step), within=folder)
+        self.lines = open_own(path, "a")
 
-    def _settings(self, step: int, text: str) -> None:
-        """Log a config, given as YAML, as text and as HParams."""
+    def _settings(self, step: int, text: str, recommended: Mapping[str, bool | float | str]) -> None:
+        """Log a config, given as YAML, as text, and its settings that are not recommended as HParams."""
         page = text_pb("config", "\n".join(f"    {line}" for line in text.splitlines()))  # indented as code in Markdown
-        settings = hparams_pb(flatten_settings(yaml.safe_load(text)), start_time_secs=time.time())
+        differing = dict(flatten_settings(parse_yaml(text)).items() - recommended.items())
+        settings = hparams_pb(differing, start_time_secs=time.time())
         self._add(step, [*page.value, *settings.value])
 
     def scalars(self, step: int, values: Mapping[str, float]) -> None:
-        """Log numbers by name, such as train/loss."""
+        """Log numbers by name, such as loss/train."""
         self._add(step, [Summary.Value(tag=name, simple_value=value) for name, value in values.items()])
         self.lines.write(json.dumps({"step": step, **values}) + "\n")
         self.lines.flush()
@@ -63,9 +62,9 @@ class RunLog:
         """Log a picture uint8 [h w 3]."""
         self._add(step, [Summary.Value(tag=name, image=_encode_image([picture], "PNG"))])
 
-    def video(self, step: int, name: str, video: np.ndarray) -> None:
-        """Log a video uint8 [t h w 3] as an animated GIF among the images."""
-        self._add(step, [Summary.Value(tag=name, image=_encode_image(list(video), "GIF"))])
+    def video(self, step: int, name: str, video: np.ndarray, frame_rate: float) -> None:
+        """Log a video uint8 [t h w 3] of a frame rate [Hz] as an animated GIF among the images, at half speed."""
+        self._add(step, [Summary.Value(tag=name, image=_encode_image(list(video), "GIF", round(2000 / frame_rate)))])
 
     def close(self) -> None:
         self.lines.close()
@@ -102,12 +101,10 @@ def _step_of(line: str) -> float:
     return step if isinstance(step, int) else math.inf
 
 
-def _encode_image(frames: list[np.ndarray], kind: str) -> Summary.Image:
+def _encode_image(frames: list[np.ndarray], kind: str, frame_ms: int = 0) -> Summary.Image:
     buffer = io.BytesIO()
     pictures = [Image.fromarray(frame) for frame in frames]
-    animation = (
-        {"save_all": True, "append_images": pictures[1:], "duration": FRAME_MILLISECONDS, "loop": 0} if kind == "GIF" else {}
-    )
+    animation = {"save_all": True, "append_images": pictures[1:], "duration": frame_ms, "loop": 0} if kind == "GIF" else {}
     pictures[0].save(buffer, format=kind, **animation)
     height, width = frames[0].shape[:2]
     return Summary.Image(height=height, width=width, colorspace=3, encoded_image_string=buffer.getvalue())

@@ -29,10 +29,13 @@ class Session:
 
 
 @contextlib.contextmanager
-def open_session(out: Path, keep: int) -> Iterator[Session]:
-    """Open the log and the checkpoints of a run, of which the last `keep` are kept; all is written when the block ends."""
+def open_session(out: Path, keep: int, recommended: Any = None) -> Iterator[Session]:
+    """Open the log and the checkpoints of a run, of which the last `keep` are kept; all is written when the block ends.
+
+    HParams leave out the settings of the config `recommended`.
+    """
     with write_checkpoints(out, keep) as checkpoints:
-        log = RunLog(out, checkpoints.latest_step() or 0) if jax.process_index() == 0 else None
+        log = RunLog(out, checkpoints.latest_step() or 0, recommended) if jax.process_index() == 0 else None
         try:
             yield Session(out, checkpoints, log)
         finally:

@@ -25,7 +25,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from xew.concurrency import map_in_order
 from xew.config import pick
 from xew.dataset import Episode
-from xew.episode import read_video
+from xew.episode import read_pixels
 from xew.model.cache.clips import gives_render, needed_pixels, read_streams, take_frames
 from xew.model.cache.scales import Scale, apply_scales
 from xew.model.codecs.contract import Codec, GivenFrames, encode_pictures, given_frames, to_pictures, to_signed
@@ -60,7 +60,7 @@ class ChunkInputs(NamedTuple):
     keys: Array
     """[b 2] uint32, data of random keys."""
     given: GivenFrames | None = None
-    """What the codec's decoder is given of the chunk's frames, or None."""
+    """Render and first frame for the codec's decoder, or None."""
 
 
 class ChunkSampling(NamedTuple):
@@ -137,7 +137,7 @@ class Predictor:
         inputs, (folder, record), clip = self.inputs, episode, self.inputs.clip
         names = [name for name, condition in inputs.conditions.items() if condition.make is not None]
         pixels = stored_pixels(folder, record, needed_pixels(inputs.conditions, names))
-        given = {FIRST: read_video(folder / "rgb.mkv", most=1)}
+        given = {FIRST: read_pixels(folder, "rgb", most=1, record=record)}
         if gives_render(self.codec, inputs.conditions):
             given[RENDER] = pixels["robot"]
         resized = {name: to_model_size(video, clip.height, clip.width) for name, video in given.items()}

@@ -23,7 +23,6 @@ LEAST_OF_STEPS: dict[str, float] = {
     "train.seed": 0,
     "train.log_every": 1,
     "train.save_every": 1,
-    "train.sample_every": 0,
     "train.keep_checkpoints": 1,
 }
 """Least values of the settings of a training run, of a world model or a codec."""
@@ -35,6 +34,7 @@ LEAST = LEAST_OF_STEPS | {
     "train.history_noise": 0,
     "train.ema": 0,
     "train.motion_loss_weight": 0,
+    "train.samples": 0,
     "adapt.lora_rank": 0,
     "rollout.steps": 1,
     "rollout.batch": 1,

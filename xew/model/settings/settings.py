@@ -78,8 +78,9 @@ class TrainSettings:
     (docs/performance.md)."""
     log_every: int = 50
     save_every: int = 2500
-    sample_every: int = 0
-    """Number of steps between sample videos in TensorBoard; 0 disables them."""
+    samples: int = 3
+    """Number of moments, evenly spaced and the last at the end, at which validation episodes are rolled out and graded for
+    TensorBoard; 0 disables them."""
     keep_checkpoints: int = 2
 
 

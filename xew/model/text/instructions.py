@@ -23,8 +23,9 @@ import tokenizers
 from flax import nnx
 from jaxtyping import Int
 
-from xew.config import ConfigError
-from xew.files import read_json, replacing
+from xew.config import CONVERTER, ConfigError
+from xew.episode import check_forms
+from xew.files import demand_regular, read_json, replacing, write_text
 from xew.model.text.umt5 import UMT5S, load_umt5
 
 VOCABULARY = 8192
@@ -136,11 +137,14 @@ def encode_with_umt5(name: str) -> Callable[[TextSource, Sequence[str]], list[np
 
     def encode(source: TextSource, instructions: Sequence[str]) -> list[np.ndarray]:
         cache = _EmbeddingCache(source, name)
-        missing = [instruction for instruction in instructions if not cache.path(instruction).exists()]
+        stored = {instruction: cache.read(instruction, UMT5S[name].dim) for instruction in instructions}
+        embeddings = {instruction: embedding for instruction, embedding in stored.items() if embedding is not None}
+        missing = [instruction for instruction in instructions if instruction not in embeddings]
         if missing:
             for instruction, embedding in zip(missing, _embed(source, name, missing), strict=True):
                 cache.write(instruction, embedding)
-        return [np.load(cache.path(instruction)) for instruction in instructions]
+                embeddings[instruction] = embedding
+        return [embeddings[instruction] for instruction in instructions]
 
     return encode
 
@@ -191,13 +195,30 @@ class _EmbeddingCache:
         key = hashlib.sha256(json.dumps([*self.source, instruction]).encode()).hexdigest()[:16]
         return self.folder / f"{key}.npy"
 
+    def read(self, instruction: str, width: int) -> np.ndarray | None:
+        """The embedding [n width] float32 of an instruction; None if it is not there or damaged."""
+        try:
+            with demand_regular(self.path(instruction)).open("rb") as file:
+                embedding: np.ndarray = np.load(file)
+            check_forms({"embedding": embedding}, {"embedding": f"float32 n {width}"})
+            return embedding
+        except Exception:  # NumPy has many
+            return None
+
     def write(self, instruction: str, embedding: np.ndarray) -> None:
-        with replacing(self.path(instruction)) as temporary, temporary.open("wb") as file:
+        with replacing(self.path(instruction), within=self.folder.parent) as temporary, temporary.open("wb") as file:
             np.save(file, embedding)
+
+    def _read_notes(self) -> dict[str, str]:
+        """The noted hashes; none if they are damaged."""
+        try:
+            return CONVERTER.structure(read_json(self.notes), dict[str, str])
+        except Exception:  # cattrs has many
+            return {}
 
     def _fingerprint(self, path: Path) -> str:
         """SHA-256 of sizes, beginnings and ends of a file or of a folder's files."""
-        noted = read_json(self.notes) if self.notes.exists() else {}
+        noted = self._read_notes()
         if not path.exists():
             if str(path) not in noted:
                 raise ConfigError(
@@ -210,9 +231,8 @@ class _EmbeddingCache:
             digest.update(f"{file.name if path.is_dir() else ''} {file.stat().st_size}".encode())
             digest.update(_ends(file))
         if noted.get(str(path)) != digest.hexdigest():
-            self.folder.mkdir(parents=True, exist_ok=True)
-            with replacing(self.notes) as temporary:
-                temporary.write_text(json.dumps(noted | {str(path): digest.hexdigest()}, indent=1) + "\n")
+            text = json.dumps(noted | {str(path): digest.hexdigest()}, indent=1) + "\n"
+            write_text(self.notes, text, within=self.folder.parent)
         return digest.hexdigest()
 
 

@@ -4,7 +4,7 @@ import contextlib
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -28,8 +28,8 @@ class Timetable:
     steps: int
     log_every: int
     save_every: int
-    sample_every: int
-    """0 disables samples."""
+    sample_steps: Collection[int]
+    """Steps after which samples are rolled out."""
     learning_rate: Callable[[int], Any]
     """Learning rate of the next step, by number of steps taken."""
     is_over: Callable[[int], bool] | None = None
@@ -70,15 +70,15 @@ class Meter:
         """Return the values of a log line, and reset the meter."""
         results, seconds = jax.device_get(self.results), time.perf_counter() - self.since
         values = self.summarize(results) | {
-            "time/step_s": seconds / len(results),
-            "time/data_wait_s": self.wait_s / len(results),
-            "time/samples_per_s": len(results) * self.samples / seconds,
+            "workload/step_s": seconds / len(results),
+            "workload/data_wait_s": self.wait_s / len(results),
+            "workload/samples_per_s": len(results) * self.samples / seconds,
         }
         peak = peak_flops(jax.devices()[0].device_kind)
         if peak and self.flops:
-            values["time/mfu"] = len(results) * self.flops / seconds / (peak * jax.device_count())
+            values["workload/mfu"] = len(results) * self.flops / seconds / (peak * jax.device_count())
         if used := (jax.local_devices()[0].memory_stats() or {}).get("peak_bytes_in_use"):
-            values["memory/peak_gb"] = used / 1e9
+            values["workload/peak_memory_gb"] = used / 1e9
         self.results, self.wait_s, self.since = [], 0.0, time.perf_counter()
         return values
 
@@ -125,7 +125,7 @@ def run_steps(
     """Train from the given state to the last step; after a signal, the current state is saved and returned.
 
     Args:
-        timetable: intervals of logging, saving and sampling.
+        timetable: intervals of logging and saving, and steps of samples.
         session: open files of the run.
         meter: of results and times.
         take_step: (state, batch) -> (next state, result).
@@ -151,7 +151,7 @@ def run_steps(
             meter.check_finite()
         if logs:
             values = meter.take() | {"train/learning_rate": float(timetable.learning_rate(step - 1))}
-            progress.set_postfix(loss=f"{values['train/loss']:.4f}")
+            progress.set_postfix(loss=f"{values['loss/train']:.4f}")
             if log:
                 log.scalars(step, values)
             stops = stops or stop.is_agreed()
@@ -161,7 +161,7 @@ def run_steps(
             of = "" if total is None else f" of {total}"
             progress.write(f"stopped at step {step}{of} and saved; continue with --resume", file=sys.stderr)
             break
-        if timetable.sample_every and (step % timetable.sample_every == 0 or last):
+        if step in timetable.sample_steps or (last and timetable.sample_steps):
             with meter.pause():
                 draw_samples(state, step)
         if last:

@@ -1,44 +1,126 @@
-"""Sample videos in training: one predicted clip of each sample episode, compared with the ground truth."""
+"""Sample rollouts in training: fixed validation episodes, graded next to the pasted render, the no-learning baseline.
 
+Reads  the sample episodes (`xew.model.episodes.choice.sample_episodes`)
+Writes scores (validation/…), strips and videos to the run's log
+"""
+
+from collections import defaultdict
 from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from xew.dataset import Episode
-from xew.episode import read_video
+from xew.episode import Record
 from xew.model.cache.scales import Scale
 from xew.model.codecs.contract import Codec
+from xew.model.conditions import pasted_render
+from xew.model.episodes.commands import episode_command
 from xew.model.experiment import Experiment
 from xew.model.runs.log import RunLog
 from xew.model.sampling.predict import make_predictor
-from xew.model.video.comparison import psnr, strip
-from xew.model.video.frames import to_model_size
+from xew.model.settings.settings import TrainSettings
+from xew.model.video.comparison import strip
+from xew.model.video.frames import to_camera_size
+from xew.protocol import PASTED_RENDER
+
+CHUNKS = 2
+"""Number of chunks of a sample rollout: the second starts from a predicted frame."""
+SCORES = {
+    "lpips": "video",
+    "psnr": "video",
+    "mask_iou": "mask",
+    "trajectory_error": "objects",
+    "object_coverage": "objects",
+}
+"""Metrics of samples, with the kind of arrays that each compares, a key of `xew.metrics.truth.NEEDS`."""
 
 
-def log_samples(
-    log: RunLog | None,
-    experiment: Experiment,
-    codec: Codec,
-    params: Any,
-    scales: Mapping[str, Scale],
-    episodes: Mapping[str, Episode],
-    step: int,
-) -> None:
-    """Predict one clip of each sample episode, by name; log PSNR, a strip (ground truth above prediction) and a video.
+def sample_steps(settings: TrainSettings) -> frozenset[int]:
+    """Steps of a run after which samples are rolled out, evenly spaced up to the last."""
+    return frozenset(settings.steps * number // settings.samples for number in range(1, settings.samples + 1)) - {0}
 
-    Every process predicts, because parameters are sharded; the one with a log writes.
-    """
-    clip = experiment.clip
-    predicted = make_predictor(experiment, codec, params, scales).predict(list(episodes.values()), clip.frames)
-    if log is None:
-        return
-    scores = {}
-    for (name, (folder, _)), video in zip(episodes.items(), predicted, strict=True):
-        truth = to_model_size(read_video(folder / "rgb.mkv")[: clip.frames], clip.height, clip.width)
-        video = video[: len(truth)]
-        scores[f"sample/psnr/{name}"] = psnr(video[1:], truth[1:])
-        scores[f"sample/psnr_of_first_frame/{name}"] = psnr(np.broadcast_to(truth[:1], truth[1:].shape), truth[1:])
-        log.image(step, f"sample/{name}", strip(truth, video))
-        log.video(step, f"sample_video/{name}", np.concatenate([truth, video], axis=2))
-    log.scalars(step, scores)
+
+@dataclass(frozen=True)
+class SampleRollouts:
+    """Rollouts of the sample episodes with any parameters of an experiment's network."""
+
+    experiment: Experiment
+    codec: Codec
+    scales: Mapping[str, Scale]
+    episodes: Mapping[str, Episode]
+    """Episodes by role and robot, such as seen/ur5_wsg."""
+
+    @property
+    def frames(self) -> int:
+        """Number of frames of a rollout."""
+        return CHUNKS * (self.experiment.clip.frames - 1) + 1
+
+    @cached_property
+    def truths(self) -> dict[str, Any]:
+        """The episodes as graders read them (`EpisodeCache`): true videos, and robots and objects if they are known."""
+        from xew.metrics.episode_cache import EpisodeCache
+        from xew.metrics.truth import read_truth
+
+        return {
+            name: EpisodeCache(read_truth(folder, self.frames, {SCORES[metric] for metric in known_scores(record)}))
+            for name, (folder, record) in self.episodes.items()
+        }
+
+    @cached_property
+    def pasted(self) -> dict[str, np.ndarray]:
+        """Pasted renders [t h w 3] uint8 of the episodes."""
+        return {name: pasted_render(episode_command(*episode))[: self.frames] for name, episode in self.episodes.items()}
+
+    @cached_property
+    def pasted_scores(self) -> dict[str, float]:
+        """Scores of the pasted renders."""
+        return self._mean_scores(self.pasted, f"_of_{PASTED_RENDER}")
+
+    def log(self, log: RunLog | None, params: Any, step: int) -> None:
+        """Roll out the episodes; log scores by role and, of each episode, a video and a strip.
+
+        A strip shows truth, prediction and pasted render. Every process predicts, because parameters are sharded; the one
+        with a log grades and writes.
+        """
+        if not self.episodes:
+            return
+        predictor = make_predictor(self.experiment, self.codec, params, self.scales)
+        predicted = predictor.predict(list(self.episodes.values()), self.frames)
+        if log is None:
+            return
+        videos = {
+            name: to_camera_size(video)[: len(self.truths[name].truth.rgb)]
+            for name, video in zip(self.episodes, predicted, strict=True)
+        }
+        log.scalars(step, self._mean_scores(videos) | self.pasted_scores)
+        for name, video in videos.items():
+            truth = self.truths[name].truth.rgb
+            log.image(step, f"validation/{name}", strip(truth, video, self.pasted[name]))
+            rate = self.episodes[name][1].frame_rate
+            log.video(step, f"validation_video/{name}", np.concatenate([truth, video], axis=2), rate)
+
+    def _mean_scores(self, videos: Mapping[str, np.ndarray], suffix: str = "") -> dict[str, float]:
+        """Mean scores of videos [t h w 3] uint8 by metric and role, as validation/lpips/seen; NaN is left out."""
+        from xew.metrics.estimators.masks import estimate_masks
+        from xew.metrics.estimators.tracks import ReferenceTracker
+        from xew.metrics.grade import Comparison, grade
+
+        values = defaultdict(list)
+        for name, video in videos.items():
+            role, truth = name.partition("/")[0], self.truths[name]
+            known = known_scores(self.episodes[name][1])
+            grades = grade(Comparison(video, truth, estimate_masks, ReferenceTracker()), known).values
+            for metric, value in grades.items():
+                values[f"validation/{metric}{suffix}/{role}"].append(value)
+        means = {name: float(np.nanmean(found)) for name, found in values.items() if not np.isnan(found).all()}
+        return dict(sorted(means.items()))
+
+
+def known_scores(record: Record) -> list[str]:
+    """The metrics of samples whose truth an episode knows; an imported one may know no robot mask and no objects."""
+    from xew.metrics.truth import NEEDS
+
+    return [metric for metric, kind in SCORES.items() if not set(NEEDS[kind]) & set(record.unknown)]

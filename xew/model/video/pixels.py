@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from xew.episode import EpisodeError, Record, read_video
+from xew.episode import EpisodeError, Record, read_pixels
 
 Pixels = Mapping[str, np.ndarray]
 PixelSource = Callable[[Path, Record, Collection[str]], Pixels]
@@ -13,20 +13,13 @@ PixelSource = Callable[[Path, Record, Collection[str]], Pixels]
 
 
 def stored_pixels(folder: Path, record: Record, names: Collection[str]) -> Pixels:
-    """The stored videos of an episode. Raises EpisodeError if one is missing or its length differs from the header."""
+    """The stored videos of an episode. Raises EpisodeError as `read_pixels`."""
     if names and not record.videos:
         raise EpisodeError(
             f"{folder} was made with --states-only and has no videos; encode it with `python -m xew.model.latents CONFIG "
             "--from-states`, or make its videos by `python -m xew.sim_warp.inspect DATA --render`."
         )
-    videos = {name: read_video(folder / f"{name}.mkv") for name in names}
-    for name, video in videos.items():
-        if len(video) != record.frame_count:
-            raise EpisodeError(
-                f"{folder}/{name}.mkv has {len(video)} frames, episode.json says {record.frame_count}; delete the episode and "
-                "run xew.sim_warp.generate again."
-            )
-    return videos
+    return {name: read_pixels(folder, name, record=record) for name in names}
 
 
 def rendered_pixels() -> PixelSource:

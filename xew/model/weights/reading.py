@@ -1,7 +1,5 @@
 """Opening checkpoints of other projects as `Tensors` by key, read lazily and never unpickled without `weights_only`."""
 
-import pickle
-import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -41,7 +39,12 @@ class Tensors(Mapping):
         self.entries, self.source = dict(entries), source
 
     def __getitem__(self, key: str) -> np.ndarray:
-        return self.entries[key].read()
+        """The tensor [...] of a key. Raises ConfigError if its type is unknown, such as a float of 8 bits."""
+        entry = self.entries[key]
+        try:
+            return entry.read()
+        except Exception as error:  # the libraries raise many types
+            raise ConfigError(f"{self.source}: {key} cannot be read ({error}); get these weights in bfloat16.") from error
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.entries)
@@ -116,8 +119,10 @@ def _open(path: Path) -> dict[str, Entry]:
 
 def _open_folder(folder: Path) -> dict[str, Entry]:
     """Open a folder by its index, else all its .safetensors, else its only .pth."""
-    indexes, shards = sorted(folder.glob("*.safetensors.index.json")), sorted(folder.glob("*.safetensors"))
-    pickles = sorted(file for file in folder.iterdir() if file.suffix in (".pth", ".pt"))
+    files = sorted(file for file in folder.iterdir() if not file.name.startswith("."))
+    indexes = [file for file in files if file.name.endswith(".safetensors.index.json")]
+    shards = [file for file in files if file.suffix == ".safetensors"]
+    pickles = [file for file in files if file.suffix in (".pth", ".pt")]
     if len(indexes) == 1:
         return _open_index(indexes[0])
     if not indexes and shards:
@@ -165,12 +170,9 @@ def _open_torch(path: Path) -> dict[str, Entry]:
         import torch
     except ImportError as error:
         raise ConfigError(f"reading {path} needs PyTorch: pip install torch; or convert it to .safetensors first.") from error
-    try:
-        content = torch.load(path, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(path))
-    except pickle.UnpicklingError as error:
-        raise ConfigError(f"{path} holds more than tensors, or is broken; get it as .safetensors.") from error
-    except (RuntimeError, EOFError, ValueError) as error:
-        raise ConfigError(f"{path} is not a whole PyTorch file ({str(error).splitlines()[0]}); download it again.") from error
+    from xew.metrics.networks.pickles import read_torch_file
+
+    content = read_torch_file(path, "PyTorch")
     state = content if isinstance(content, Mapping) else {}
     state = next((state[name] for name in STATE_DICTS if isinstance(state.get(name), Mapping)), state)
     tensors = {

@@ -51,7 +51,7 @@ def _convert(leaves: Mapping[str, nnx.Variable], layout: Layout) -> Iterator[tup
 
 def _write(path: Path, tensors: dict[str, np.ndarray]) -> None:
     """Write a file atomically, with the user's default permissions."""
-    with replacing(path) as partial:
+    with replacing(path, within=path.parent) as partial:
         save_file(tensors, partial, metadata={"format": "pt"})
         mask = os.umask(0)  # the library's files are readable by their owner only
         os.umask(mask)
@@ -71,7 +71,8 @@ def _write_shards(folder: Path, leaves: Mapping[str, nnx.Variable], layout: Layo
     for shard, tensors in itertools.groupby(_convert(leaves, layout), key=lambda item: plan[item[0]]):
         _write(folder / names[shard], dict(tensors))
     index = {"metadata": {"total_size": sum(sizes.values())}, "weight_map": {key: names[shard] for key, shard in plan.items()}}
-    write_text(folder / "diffusion_pytorch_model.safetensors.index.json", json.dumps(index, indent=2, sort_keys=True))
+    text = json.dumps(index, indent=2, sort_keys=True)
+    write_text(folder / "diffusion_pytorch_model.safetensors.index.json", text, within=folder)
 
 
 def _plan_shards(sizes: Mapping[str, int], limit: int) -> dict[str, int]:

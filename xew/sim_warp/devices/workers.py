@@ -13,7 +13,7 @@ from typing import TypeVar
 
 import warp
 
-from xew.concurrency import open_processes, usable_cores
+from xew.concurrency import KILLED, open_processes, usable_cores
 from xew.config import ConfigError
 from xew.episode import EpisodeError
 
@@ -102,10 +102,7 @@ class Workers:
                 for future in done:
                     yield future.result()
         except BrokenProcessPool as error:
-            raise EpisodeError(
-                "a worker process was killed, perhaps for lack of memory. Completed work is stored: run the command again, "
-                "with fewer --workers if it happens again."
-            ) from error
+            raise EpisodeError(f"{KILLED}, with fewer --workers if it happens again.") from error
 
 
 def _begin_worker(device: str | None = None) -> None:

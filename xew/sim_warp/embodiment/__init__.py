@@ -3,4 +3,4 @@
 They are read once, checked, and never changed. `xew.sim_warp.robots` lists the robots.
 """
 
-__all__ = ["mesh_files", "prepared", "spec", "urdf"]
+__all__ = ["mesh_claims", "mesh_files", "named_files", "prepared", "spec", "urdf", "xml_files"]

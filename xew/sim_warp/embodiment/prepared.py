@@ -1,7 +1,8 @@
 """Shapes of a URDF as arrays in prepared.npz next to it: a load then reads and merges no mesh files.
 
-The file is valid for the URDF whose digest it holds, and is for folders that never change: the cache of procedural bodies. Its
-arrays are bit for bit what the mesh files give.
+The file is valid for the URDF whose digest it holds, and is for folders that never change: the cache of procedural bodies. It
+is read nowhere else, because a file next to a user's robot could say anything. Its arrays are bit for bit what the mesh files
+give.
 """
 
 import hashlib
@@ -12,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from xew.files import cache_folder
 from xew.sim_warp.geometry.meshes import Mesh
 
 PREPARED = "prepared.npz"
@@ -31,6 +33,11 @@ class Prepared:
     """File of each mesh by its name in the URDF."""
 
 
+def bodies_folder() -> Path:
+    """Folder of procedural bodies in the user's cache."""
+    return cache_folder("bodies")
+
+
 def write_prepared(path: Path, prepared: Prepared) -> None:
     """Write the shapes of the URDF at `path` next to it."""
     index: dict[str, tuple[bool, list[str]]] = {}
@@ -45,19 +52,26 @@ def write_prepared(path: Path, prepared: Prepared) -> None:
 
 
 def read_prepared(path: Path) -> Prepared | None:
-    """The stored shapes of the URDF at `path`; None if there are none, or they belong to another URDF."""
+    """The stored shapes of the URDF at `path`; None if there are none, they are damaged, or they belong to another URDF."""
     file = path.with_name(PREPARED)
-    if not file.is_file():
+    if not path.resolve().is_relative_to(bodies_folder().resolve()) or not file.is_file():
         return None
-    with np.load(file, allow_pickle=False) as arrays:
-        index = json.loads(arrays["index"].tobytes())
-        if index["urdf"] != hashlib.sha256(path.read_bytes()).hexdigest():
-            return None
-        shapes = {
-            link: (
-                Mesh(*(arrays[f"{link}/{name}"] for name in MESH_ARRAYS)) if has_visual else None,
-                tuple((name, arrays[f"{link}/{number}"]) for number, name in enumerate(hulls)),
-            )
-            for link, (has_visual, hulls) in index["links"].items()
-        }
+    try:
+        with file.open("rb") as content, np.load(content, allow_pickle=False) as arrays:
+            return _unpack(arrays, path)
+    except Exception:  # each kind of damage has its own; the mesh files say the same
+        return None
+
+
+def _unpack(arrays: Mapping[str, np.ndarray], path: Path) -> Prepared | None:
+    index = json.loads(arrays["index"].tobytes())
+    if index["urdf"] != hashlib.sha256(path.read_bytes()).hexdigest():
+        return None
+    shapes = {
+        link: (
+            Mesh(*(arrays[f"{link}/{name}"] for name in MESH_ARRAYS)) if has_visual else None,
+            tuple((name, arrays[f"{link}/{number}"]) for number, name in enumerate(hulls)),
+        )
+        for link, (has_visual, hulls) in index["links"].items()
+    }
     return Prepared(shapes, {name: path.parent / file for name, file in index["meshes"].items()})

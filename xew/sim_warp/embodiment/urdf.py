@@ -3,13 +3,13 @@
 yourdfpy parses the XML, trimesh the mesh files. Units are meters, kilograms and radians; shapes are in the frame of their link.
 """
 
+import io
 import math
-import re
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Callable, Iterable
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
-from itertools import product
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -17,9 +17,12 @@ import numpy as np
 import trimesh
 import yourdfpy
 
-from xew.config import ConfigError
-from xew.sim_warp.embodiment.mesh_files import MeshError, MeshFile, Part, picture_colors, read_mesh, read_picture
+from xew.config import suggestion
+from xew.sim_warp.embodiment.mesh_claims import MeshError
+from xew.sim_warp.embodiment.mesh_files import MeshFile, Part, picture_colors, read_mesh, read_picture
+from xew.sim_warp.embodiment.named_files import find_file, missing_file
 from xew.sim_warp.embodiment.prepared import Prepared, read_prepared, write_prepared
+from xew.sim_warp.embodiment.xml_files import UrdfError, angle_notes, check_elements, problem_lines, read_xml
 from xew.sim_warp.geometry.meshes import Color, Mesh, from_trimesh, merge
 
 Entry = TypeVar("Entry", bound=Any)
@@ -30,10 +33,12 @@ HULL_POINTS = 64
 """Largest number of corners of a collision hull; finer hulls keep the outermost corner in each of as many directions."""
 LARGEST_LINK = 10.0
 """Largest extent of a link [m]; larger meshes are probably in millimeters."""
-
-
-class UrdfError(ConfigError):
-    """A URDF or one of its meshes cannot be used; the message says what to do."""
+USUAL_LINK = (0.001, 2.0)
+"""Extents of links between which nothing is noted [m]."""
+UNLIKE = 8.0
+"""Ratio of the extents of a link's visual and collision shapes from which their units probably differ."""
+MOST_TRIANGLES = 5_000_000
+"""Largest number of triangles of a robot."""
 
 
 @dataclass(frozen=True)
@@ -86,7 +91,8 @@ class Joint:
     effort: float
     """Effort limit [N m or N], inf where there is none."""
     mimic: tuple[str, float, float] | None = None
-    """Joint that this one mimics, with factor and offset; None if it moves independently."""
+    """Joint that this one mimics, with factor and offset; None if it moves independently. The joint exists, and following such
+    joints ends."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +109,14 @@ class Urdf:
     files: tuple[Path, ...]
     """Files that were read: the URDF, meshes, their materials and textures."""
     notes: tuple[str, ...] = ()
-    """Sentences on deviations from the file's content."""
+    """Sentences on deviations from the file's content, and on what is probably wrong in it."""
+    ignored_mimics: tuple[str, ...] = ()
+    """Sentences on mimic tags that lead nowhere; they are also among the notes."""
+
+    @property
+    def mimic_hint(self) -> str:
+        """Sentences on ignored mimic tags, for errors on hands."""
+        return "".join(f" Note: {sentence}." for sentence in self.ignored_mimics)
 
     @cached_property
     def joint_names(self) -> tuple[str, ...]:
@@ -154,33 +167,115 @@ def load_urdf(path: Path | str) -> Urdf:
 
 @lru_cache(maxsize=256)
 def _load(path: Path, modified: int) -> Urdf:
+    root = check_elements(read_xml(path), path)
+    robot = _parse(root, path)
+    source = _Source(path, read_prepared(path), notes=angle_notes(root))
+    source.materials = _define_materials(robot, source.notes)
+    problems: list[str] = []
+    links = _read_all(robot.links, lambda link: _link(link, source), problems)
+    read_joints = _read_all(robot.joints, lambda joint: _joint(joint, path), problems)
+    if problems:
+        raise UrdfError(*problem_lines(path, problems))
+    joints, ignored = _drop_broken_mimics(read_joints)
+    source.notes += [*ignored, *_size_notes(links)]
+    links = _with_hulls(links, source.notes)
+    notes = tuple(dict.fromkeys(source.notes))
+    urdf = Urdf(robot.name, path, _root(links, joints, path), links, joints, source.meshes, source.files, notes, ignored)
+    _check_tree(urdf)
+    return urdf
+
+
+def _parse(root: ElementTree.Element, path: Path) -> yourdfpy.Robot:
+    """The robot by yourdfpy, with unique names."""
     try:
-        ElementTree.parse(path)  # yourdfpy accepts truncated files
-        robot = yourdfpy.URDF.load(str(path), build_scene_graph=False, load_meshes=False).robot
+        content = io.BytesIO(ElementTree.tostring(root, encoding="utf-8"))
+        robot = yourdfpy.URDF.load(content, build_scene_graph=False, load_meshes=False).robot
     except Exception as error:  # lxml and yourdfpy each have their own
         raise UrdfError(f"{path} is not a URDF that can be read ({error}); fix its XML.") from error
     for kind, entries in (("link", robot.links), ("joint", robot.joints)):
-        _check_names(path, kind, [entry.name for entry in entries])
-    source = _Source(path, {material.name: material for material in robot.materials}, {}, read_prepared(path))
-    problems: list[str] = []
-    links = _read_all(robot.links, lambda link: _link(link, source), problems)
-    joints = _read_all(robot.joints, lambda joint: _joint(joint, path), problems)
-    if problems:
-        few = [problem.removeprefix(f"{path}: ") for problem in problems]
-        raise UrdfError("\n  ".join([f"{path} has {len(few)} problems:", *few]) if len(few) > 1 else problems[0])
+        if twice := sorted(name for name, count in Counter(entry.name for entry in entries).items() if count > 1):
+            raise UrdfError(f"{path}: more than one {kind} is called {', '.join(twice)}; names must be unique.")
+    return robot
+
+
+def _root(links: Iterable[str], joints: Mapping[str, Joint], path: Path) -> str:
+    """The first link without a parent."""
     children = {joint.child for joint in joints.values()}
-    root = next((name for name in links if name not in children), "")
-    if not root:
+    if (root := next((name for name in links if name not in children), None)) is None:
         raise UrdfError(f"{path}: there is no link without a parent; links must form one tree.")
-    if not any(link.collisions for link in links.values()):
-        source.notes.append("it has no collision shapes: the convex hulls of its visuals collide instead")
-        links = {name: _with_hull(link) for name, link in links.items()}
-    prepared = dict(source.prepared.meshes) if source.prepared else {}
-    meshes = {name: file.files[0] for name, file in source.meshes.items()} | prepared | source.textures
-    read = [*prepared.values(), *(f for mesh in source.meshes.values() for f in mesh.files), *source.textures.values()]
-    urdf = Urdf(robot.name, path, root, links, joints, meshes, tuple(dict.fromkeys([path, *read])), tuple(source.notes))
-    _check_tree(urdf)
-    return urdf
+    return root
+
+
+def _define_materials(robot: yourdfpy.Robot, notes: list[str]) -> dict[str, yourdfpy.Material]:
+    """The materials with a color or texture by their name, those of the robot before those in links."""
+    inner = [visual.material for link in robot.links for visual in link.visuals if visual.material is not None]
+    defined: dict[str, yourdfpy.Material] = {}
+    for material in [*robot.materials, *inner]:
+        if material.name and _has_content(material):
+            first = defined.setdefault(material.name, material)
+            if material.color is not None and first.color is not None and material.color != first.color:
+                notes.append(f"the material {material.name} has several colors: each link keeps its own")
+    notes += [
+        f"link {link.name} names the material {visual.material.name}, which is defined nowhere"
+        for link in robot.links
+        for visual in link.visuals
+        if visual.material is not None and visual.material.name and visual.material.name not in defined
+    ]
+    return defined
+
+
+def _has_content(material: yourdfpy.Material) -> bool:
+    return material.color is not None or bool(material.texture is not None and material.texture.filename)
+
+
+def _drop_broken_mimics(joints: Mapping[str, Joint]) -> tuple[dict[str, Joint], tuple[str, ...]]:
+    """The joints without mimic tags that name no joint or lead back to themselves, and a sentence on each of these."""
+    sentences = {}
+    for joint in joints.values():
+        if joint.mimic is None:
+            continue
+        other = joint.mimic[0]
+        if other not in joints:
+            reason = f"which does not exist;{suggestion(other, joints) or ' correct the name.'}"
+        elif _mimics_itself(joint, joints):
+            reason = "which is itself." if other == joint.name else "which mimics it in turn."
+        else:
+            continue
+        sentences[joint.name] = f"joint {joint.name} mimics {other}, {reason} It is read as independent"
+    kept = {name: replace(joint, mimic=None) if name in sentences else joint for name, joint in joints.items()}
+    return kept, tuple(sentences.values())
+
+
+def _mimics_itself(joint: Joint, joints: Mapping[str, Joint]) -> bool:
+    """Whether following the mimic tags from a joint leads back to it."""
+    seen, name = set(), joint.name
+    while name in joints and name not in seen and (mimic := joints[name].mimic) is not None:
+        seen.add(name)
+        name = mimic[0]
+    return name == joint.name and name in seen
+
+
+def _size_notes(links: Mapping[str, Link]) -> list[str]:
+    """Sentences on links whose units are probably wrong."""
+    notes = []
+    for link in links.values():
+        if link.visual is None:
+            continue
+        size = _extent(link.visual.vertices)
+        if not USUAL_LINK[0] <= size <= USUAL_LINK[1]:
+            factors = "its mesh in centimeters needs a scale of 0.01, in inches 0.0254, in millimeters 0.001"
+            fault = factors if size > 1 else "a factor of 0.001 is probably applied twice"
+            notes.append(f"link {link.name} is {size:.3g} m large: {fault}")
+        collided = [shape.points for shape in link.collisions]
+        ratio = size / _extent(np.concatenate(collided)) if collided else 1.0
+        if not 1 / UNLIKE < ratio < UNLIKE:
+            notes.append(f"link {link.name} is seen {ratio:.3g} times as large as it collides: check the units of its meshes")
+    return notes
+
+
+def _extent(points: np.ndarray) -> float:
+    """Largest extent of points [k 3] along an axis [m], at least 1 nm."""
+    return max(float(np.ptp(points, axis=0).max()), 1e-9)
 
 
 def _read_all(entries: Iterable[Entry], read: Callable[[Entry], Result], problems: list[str]) -> dict[str, Result]:
@@ -194,6 +289,14 @@ def _read_all(entries: Iterable[Entry], read: Callable[[Entry], Result], problem
     return results
 
 
+def _with_hulls(links: dict[str, Link], notes: list[str]) -> dict[str, Link]:
+    """The links, with convex hulls of their visuals as collision shapes if no link has any."""
+    if any(link.collisions for link in links.values()):
+        return links
+    notes.append("it has no collision shapes: the convex hulls of its visuals collide instead")
+    return {name: _with_hull(link) for name, link in links.items()}
+
+
 def _with_hull(link: Link) -> Link:
     """The link with the convex hull of its visual as collision shape, if the hull has a volume."""
     if link.visual is None:
@@ -205,19 +308,42 @@ def _with_hull(link: Link) -> Link:
     return replace(link, collisions=(Collision("", outermost_points(np.asarray(corners, np.float32), HULL_POINTS)),))
 
 
-@dataclass(frozen=True)
+@dataclass
 class _Source:
     """State of reading a URDF."""
 
     path: Path
-    materials: dict[str, yourdfpy.Material]
-    meshes: dict[str, MeshFile]
-    """Mesh files read so far, by their name in the URDF."""
     prepared: Prepared | None
     """Stored shapes of the URDF, if any."""
-    textures: dict[str, Path] = field(default_factory=dict)
-    """Texture images, by their name in the URDF."""
+    materials: dict[str, yourdfpy.Material] = field(default_factory=dict)
+    read: dict[Path, MeshFile] = field(default_factory=dict)
+    """Mesh files read so far."""
+    named: dict[str, Path] = field(default_factory=dict)
+    """Mesh files and texture images by their name in the URDF."""
+    triangles: int = 0
+    """Number of triangles so far."""
     notes: list[str] = field(default_factory=list)
+
+    @property
+    def meshes(self) -> dict[str, Path]:
+        """Meshes and textures by their name in the URDF."""
+        return (dict(self.prepared.meshes) if self.prepared else {}) | self.named
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """All files read: the URDF, meshes with their materials, textures."""
+        prepared = self.prepared.meshes.values() if self.prepared else ()
+        meshes = [file for mesh in self.read.values() for file in mesh.files]
+        return tuple(dict.fromkeys([self.path, *prepared, *meshes, *self.named.values()]))
+
+    def find(self, name: str, who: str) -> Path:
+        """The file of a name in the URDF; `who` begins the error's sentence. Raises UrdfError if it is nowhere."""
+        found = find_file(name, self.path.parent)
+        if found is None:
+            raise UrdfError(missing_file(self.path, who, name))
+        self.named[name], note = found
+        self.notes += [note] if note else []
+        return found[0]
 
 
 def prepare(path: Path) -> None:
@@ -228,11 +354,6 @@ def prepare(path: Path) -> None:
     urdf = _load.__wrapped__(path, 0)
     shapes = {name: (link.visual, tuple((c.name, c.points) for c in link.collisions)) for name, link in urdf.links.items()}
     write_prepared(path, Prepared(shapes, urdf.meshes))
-
-
-def _check_names(path: Path, kind: str, names: list[str]) -> None:
-    if twice := sorted({name for name in names if names.count(name) > 1}):
-        raise UrdfError(f"{path}: more than one {kind} is called {', '.join(twice)}; names must be unique.")
 
 
 def _finite_array(values: object, path: Path, what: str) -> np.ndarray:
@@ -248,8 +369,8 @@ def _check_tree(urdf: Urdf) -> None:
     path, links, joints = urdf.path, set(urdf.links), urdf.joints.values()
     if unknown := sorted({name for joint in joints for name in (joint.parent, joint.child)} - links):
         raise UrdfError(f"{path}: joints name links that do not exist: {', '.join(unknown)}; add or rename them.")
-    children = [joint.child for joint in joints]
-    if twice := sorted({name for name in children if children.count(name) > 1}):
+    children = Counter(joint.child for joint in joints)
+    if twice := sorted(name for name, count in children.items() if count > 1):
         raise UrdfError(f"{path}: links must form one tree; more than one joint leads to {', '.join(twice)}.")
     if loose := sorted(links - {urdf.root, *(joint.child for joint in urdf.tree)}):
         raise UrdfError(f"{path}: links must form one tree; no way leads from {urdf.root} to {', '.join(loose)}.")
@@ -331,7 +452,8 @@ def _inertial(link: yourdfpy.Link, path: Path) -> Inertial | None:
 def _visual(visual: yourdfpy.Visual, link: str, source: _Source) -> Iterable[Mesh]:
     """One mesh per part, colored by the visual's material or else by the mesh file."""
     origin = _origin(visual.origin, source.path, f"a visual of link {link}")
-    color, picture = _material_color(visual, source), _material_texture(visual, link, source)
+    material = _material(visual, source)
+    color, picture = _material_color(material), _material_texture(material, link, source)
     for part in _shape(visual.geometry, link, source):
         shape = part.shape
         if visual.origin is not None:
@@ -341,30 +463,25 @@ def _visual(visual: yourdfpy.Visual, link: str, source: _Source) -> Iterable[Mes
         yield mesh if colors is None or (color and picture is None) else replace(mesh, colors=colors)
 
 
-def _material_entry(visual: yourdfpy.Visual, source: _Source, name: str) -> Any | None:
-    """The color or texture of a visual's material or of the global material of its name; None if neither has it."""
-    if visual.material is None:
-        return None
-    known = source.materials.get(visual.material.name)
-    return getattr(visual.material, name) or (known and getattr(known, name)) or None
+def _material(visual: yourdfpy.Visual, source: _Source) -> yourdfpy.Material | None:
+    """The material of a visual: its own, or else the one that is defined elsewhere under its name."""
+    material = visual.material
+    return material if material is None or _has_content(material) else source.materials.get(material.name)
 
 
-def _material_color(visual: yourdfpy.Visual, source: _Source) -> Color | None:
-    """The color of a visual's material; None if the mesh file has the colors."""
-    color = _material_entry(visual, source, "color")
-    if color is None:
+def _material_color(material: yourdfpy.Material | None) -> Color | None:
+    """The color of a material; None if it has none."""
+    if material is None or material.color is None:
         return None
-    red, green, blue = (round(255 * min(max(float(value), 0.0), 1.0)) for value in color.rgba[:3])
+    red, green, blue = (round(255 * min(max(float(value), 0.0), 1.0)) for value in material.color.rgba[:3])
     return red, green, blue
 
 
-def _material_texture(visual: yourdfpy.Visual, link: str, source: _Source) -> Any | None:
-    """The texture image of a visual's material; None if there is none."""
-    texture = _material_entry(visual, source, "texture")
-    if texture is None or not texture.filename:
+def _material_texture(material: yourdfpy.Material | None, link: str, source: _Source) -> Any | None:
+    """The texture image of a material; None if it has none."""
+    if material is None or material.texture is None or not material.texture.filename:
         return None
-    path = _find_file(texture.filename, f"link {link} names the texture", source)
-    source.textures[texture.filename] = path
+    path = source.find(material.texture.filename, f"link {link} names the texture")
     try:
         return read_picture(path)
     except MeshError as error:
@@ -395,51 +512,31 @@ def outermost_points(points: np.ndarray, most: int) -> np.ndarray:
 
 def _shape(geometry: yourdfpy.Geometry, link: str, source: _Source) -> list[Part]:
     """The triangles of one geometry element, before its origin is applied; the caller may move them."""
-    if geometry.box is not None:
-        return [Part(trimesh.creation.box(geometry.box.size), None)]
-    if geometry.cylinder is not None:
-        return [Part(trimesh.creation.cylinder(geometry.cylinder.radius, geometry.cylinder.length, sections=24), None)]
-    if geometry.sphere is not None:
-        return [Part(trimesh.creation.icosphere(2, geometry.sphere.radius), None)]
-    if geometry.mesh is not None:
-        return _mesh_parts(geometry.mesh, link, source)
-    raise UrdfError(f"{source.path}: link {link} has an empty geometry; expected box, cylinder, sphere or mesh.")
-
-
-def _mesh_parts(mesh: yourdfpy.Mesh, link: str, source: _Source) -> list[Part]:
-    if mesh.filename not in source.meshes:
-        path = _find_file(mesh.filename, f"link {link} names the mesh", source)
-        try:
-            source.meshes[mesh.filename] = read_mesh(path)
-        except MeshError as error:
-            raise UrdfError(f"{source.path}: link {link}: {path} {error}.") from error
-    scale = np.broadcast_to(np.asarray(1.0 if mesh.scale is None else mesh.scale, float), 3)
-    parts = [Part(part.shape.copy(), part.colors) for part in source.meshes[mesh.filename].parts]
-    for part in parts:
-        part.shape.apply_scale(_finite_array(scale, source.path, f"the scale of a mesh of link {link}"))
+    parts = _mesh_parts(geometry.mesh, link, source) if geometry.mesh is not None else [Part(_solid(geometry), None)]
+    source.triangles += sum(len(part.shape.faces) for part in parts)
+    if source.triangles > MOST_TRIANGLES:
+        raise UrdfError(f"{source.path}: its shapes have more than {MOST_TRIANGLES} triangles; simplify the meshes.")
     return parts
 
 
-def _find_file(name: str, who: str, source: _Source) -> Path:
-    """A file by its name in the URDF: relative to the URDF, absolute, `file://` or `package://`.
+def _solid(geometry: yourdfpy.Geometry) -> trimesh.Trimesh:
+    if geometry.box is not None:
+        return trimesh.creation.box(geometry.box.size)
+    if geometry.cylinder is not None:
+        return trimesh.creation.cylinder(geometry.cylinder.radius, geometry.cylinder.length, sections=24)
+    return trimesh.creation.icosphere(2, geometry.sphere.radius)
 
-    An absolute name of another machine is searched by its end in the URDF's folder and the two folders above. `who` begins the
-    error's sentence.
-    """
-    folder = source.path.parent
-    path = Path(yourdfpy.urdf.filename_handler_magic(name, dir=str(folder)))
-    if path.is_file():
-        return path
-    package = re.fullmatch(r"package://([^/]+)/.*", name)
-    parts = [part for part in re.sub(r"^[a-z]+://", "", name).split("/") if part not in ("", ".", "..")]
-    if not package and (name.startswith("file://") or Path(name).is_absolute()):
-        for near, skipped in product((folder, *folder.parents[:2]), range(len(parts))):
-            if (other := near.joinpath(*parts[skipped:])).is_file():
-                source.notes.append(f"{name} is not on this machine: {other} is used instead")
-                return other
-    advice = (
-        f"name the package's folder: python -m xew.sim_warp.robots.adopt {source.path} --package {package[1]}=DIR"
-        if package
-        else "put it there or correct the name"
-    )
-    raise UrdfError(f"{source.path}: {who} {name}, which does not exist; {advice}.")
+
+def _mesh_parts(mesh: yourdfpy.Mesh, link: str, source: _Source) -> list[Part]:
+    path = source.named.get(mesh.filename) or source.find(mesh.filename, f"link {link} names the mesh")
+    if path not in source.read:
+        try:
+            source.read[path] = read_mesh(path)
+        except MeshError as error:
+            raise UrdfError(f"{source.path}: link {link}: {path} {error}.") from error
+        source.notes += source.read[path].notes
+    scale = np.broadcast_to(np.asarray(1.0 if mesh.scale is None else mesh.scale, float), 3)
+    parts = [Part(part.shape.copy(), part.colors) for part in source.read[path].parts]
+    for part in parts:
+        part.shape.apply_scale(_finite_array(scale, source.path, f"the scale of a mesh of link {link}"))
+    return parts

@@ -16,11 +16,10 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from tqdm import tqdm
 
 import xew
-from xew.dataset import Episode
-from xew.episode import EpisodeError, States, data_folder, read_states, read_video
+from xew.dataset import Episode, demand_one_rate
+from xew.episode import EpisodeError, States, data_folder, read_pixels, read_states
 from xew.files import hold_lock, read_text, write_text
-from xew.names import path_below
-from xew.rollout import Rollout, find_rollouts, read_rollout_video, resize_video
+from xew.rollout import Rollout, find_rollouts, read_as_graded
 from xew.sim_warp.inspection.films import Row, difference_video, tile_frames, tile_size, write_film
 from xew.sim_warp.inspection.overlays import frame_psnr, overlay_data
 from xew.sim_warp.robots import ROBOTS, recorded_robot
@@ -153,7 +152,8 @@ def write_page(page: Page, out: Path) -> None:
             entries = [_write_scene(number, scene, page, out) for number, scene in enumerate(bar)]
             template = TEMPLATES.get_template("explorer.html")
             version = f"xew {xew.__version__}"
-            write_text(index, template.render(page=page, index={"scenes": entries}, mark=MARK, version=version))
+            html = template.render(page=page, index={"scenes": entries}, mark=MARK, version=version)
+            write_text(index, html, within=out)
     except (OSError, UnicodeDecodeError) as error:
         raise EpisodeError(f"cannot write the page to {out}: {error}. Choose another folder with --page.") from error
 
@@ -161,21 +161,21 @@ def write_page(page: Page, out: Path) -> None:
 def _write_scene(number: int, scene: Scene, page: Page, out: Path) -> dict[str, Any]:
     """Write the script and the films of a scene; returns its entry in the page's index."""
     stem = f"scenes/{number:03d}_{NO_FILE_NAME.sub('-', scene.task)}_{scene.seed}"
-    truths = [read_video(folder / "rgb.mkv") for folder, _ in scene.cells]
+    truths = [read_pixels(folder, "rgb") for folder, _ in scene.cells]
     states = [read_states(folder) for folder, _ in scene.cells]
-    for (folder, record), truth, of_cell in zip(scene.cells, truths, states, strict=True):
-        if len(truth) != of_cell.frame_count or not 1 <= record.frame_rate <= 1000:
+    for (folder, _), truth, of_cell in zip(scene.cells, truths, states, strict=True):
+        if len(truth) != of_cell.frame_count:
             raise EpisodeError(
-                f"{folder} has {len(truth)} frames in rgb.mkv and {of_cell.frame_count} in states.npz, "
-                f"at {record.frame_rate:g} a second, expected as many in both, at 1 to 1000 a second; "
-                "delete it and run generate again."
+                f"{folder} has {len(truth)} frames in rgb.mkv and {of_cell.frame_count} in states.npz, expected as many in "
+                "both; delete it and run generate again."
             )
+    rate = float(demand_one_rate(data_folder(scene.cells[0][0]), (record for _, record in scene.cells)))
     rows: dict[str, Row] = {"video": truths}
     if page.flow:
         rows["flow"] = [_flow(cell, of_cell) for cell, of_cell in zip(scene.cells, states, strict=True)]
     content = {
         "frames": max(map(len, truths)),
-        "rate": scene.cells[0][1].frame_rate,
+        "rate": rate,
         "films": _write_films(stem, scene, page, rows, out),
         "robots": [
             {
@@ -189,7 +189,7 @@ def _write_scene(number: int, scene: Scene, page: Page, out: Path) -> dict[str, 
         ],
     }
     text = json.dumps(content, separators=(",", ":"), allow_nan=False)
-    write_text(path_below(out, f"{stem}.js"), f"explorerScene({number}, {text});\n")
+    write_text(out / f"{stem}.js", f"explorerScene({number}, {text});\n", within=out)
     return {
         "task": scene.task,
         "seed": scene.seed,
@@ -204,7 +204,10 @@ def _write_films(stem: str, scene: Scene, page: Page, rows: dict[str, Row], out:
     truths = [truth for truth in rows["video"] if truth is not None]
     films = []
     for place, (label, rollouts) in enumerate(_models(scene, page.predictions)):
-        predicted = [_read_prediction(rollout, truth, page.given) for rollout, truth in zip(rollouts, truths, strict=True)]
+        predicted = [
+            None if rollout is None else read_as_graded(rollout, truth, page.given)
+            for rollout, truth in zip(rollouts, truths, strict=True)
+        ]
         pairs = list(zip(predicted, truths, strict=True))
         shown = dict(rows)
         if label:
@@ -212,7 +215,8 @@ def _write_films(stem: str, scene: Scene, page: Page, rows: dict[str, Row], out:
             shown["difference"] = [None if video is None else difference_video(video, truth) for video, truth in pairs]
         tiles = list(shown.values())
         name = f"{stem}_{place}.mp4"
-        write_film(path_below(out, name), tile_frames(tiles, max(map(len, truths))), scene.cells[0][1].frame_rate)
+        frames = tile_frames(tiles, max(map(len, truths)))
+        write_film(out / name, frames, scene.cells[0][1].frame_rate, within=out)
         height, width = tile_size(tiles)
         errors = [None if video is None else frame_psnr(video, truth) for video, truth in pairs]
         films.append({"label": label, "file": name, "rows": list(shown), "tile": [width, height], "psnr": errors})
@@ -235,11 +239,3 @@ def _models(scene: Scene, predictions: Predictions) -> list[tuple[str, list[Roll
         if any(of_scene):
             models.append((label, of_scene))
     return models or [("", [None] * len(scene.cells))]
-
-
-def _read_prediction(rollout: Rollout | None, truth: np.ndarray, given: bool) -> np.ndarray | None:
-    """The video of a rollout at its episode's size, at most as long as the episode: [t h w 3] uint8."""
-    if rollout is None:
-        return None
-    video = resize_video(read_rollout_video(rollout), truth.shape[1:3])
-    return (video if given else np.concatenate([truth[:1], video]))[: len(truth)]

@@ -1,13 +1,13 @@
 """One H.264 file for all videos of a scene, as rows and columns of tiles: they stay synchronized, and a step is one seek."""
 
 from collections.abc import Iterable, Iterator, Sequence
-from fractions import Fraction
 from pathlib import Path
 
 import av
 import numpy as np
 from av.video.reformatter import Colorspace
 
+from xew.episode import exact_rate
 from xew.files import replacing
 
 __all__ = ["Row", "difference_video", "tile_frames", "tile_size", "write_film"]
@@ -58,14 +58,14 @@ def difference_video(prediction: np.ndarray, truth: np.ndarray) -> np.ndarray:
     return np.repeat((255 - scaled).astype(np.uint8)[..., None], 3, -1)
 
 
-def write_film(path: Path, frames: Iterable[np.ndarray], frame_rate: float) -> None:
+def write_film(path: Path, frames: Iterable[np.ndarray], frame_rate: float, *, within: Path) -> None:
     """Write frames [h w 3] uint8 RGB of even height and width as H.264 for browsers, in MP4; frame k begins at k / rate.
 
     Raises:
         OSError: the file cannot be written, or the disk is full.
     """
-    rate = Fraction(frame_rate).limit_denominator(1000)
-    with replacing(path) as temporary:
+    rate = exact_rate(frame_rate)
+    with replacing(path, within=within) as temporary:
         options = {"movflags": "+faststart", "fflags": "+bitexact"}
         with av.open(str(temporary), "w", format="mp4", container_options=options) as container:
             stream = container.add_stream("libx264", rate=rate, options=ENCODER)

@@ -9,7 +9,7 @@ import numpy as np
 from PIL import Image
 from tqdm import tqdm
 
-from xew.episode import HEIGHT, WIDTH, EpisodeError, Record, encode_png, read_record, read_states, read_video
+from xew.episode import HEIGHT, WIDTH, EpisodeError, Record, encode_png, read_pixels, read_record, read_states
 from xew.files import replacing, write_bytes
 from xew.names import folder_name, path_below
 from xew.sim_warp.robots import ROBOTS
@@ -57,7 +57,7 @@ def draw_grid(cells: list[tuple[Path, Record]], path: Path) -> None:
     _make_folder(path.parent, "--grid")
     picture = grid([of_task[min(of_task)] for of_task in seeds_by_task(cells).values()])
     try:
-        with replacing(path) as temporary:
+        with replacing(path, within=path.parent) as temporary:
             Image.fromarray(picture).save(temporary, format="PNG", optimize=True)
     except OSError as error:
         raise EpisodeError(f"cannot write {path}: {error.strerror}. Choose another file with --grid.") from error
@@ -88,9 +88,7 @@ def _column(cells: list[tuple[Path, Record]], robots: list[str]) -> np.ndarray:
     """A task's name over one picture per robot: [h w 3] uint8."""
     folders = {record.robot: folder for folder, record in cells}
     instants = dict(zip(folders, busy_instants([read_states(folder).contact for folder in folders.values()]), strict=True))
-    images = [
-        _halve(read_video(folders[robot] / "rgb.mkv")[instants[robot]]) if robot in folders else BLANK for robot in robots
-    ]
+    images = [_halve(read_pixels(folders[robot], "rgb")[instants[robot]]) if robot in folders else BLANK for robot in robots]
     name = cells[0][1].task.rsplit(":", 1)[-1]
     return np.concatenate([_label(name, WIDTH // 2 + GAP), tile([[image] for image in images])])
 
@@ -127,7 +125,7 @@ def contact_sheet(cells: list[tuple[Path, Record]]) -> np.ndarray:
     """The instruction over one row per robot: its start, middle and end: [h w 3] uint8."""
     rows = []
     for folder, _ in cells:
-        video = read_video(folder / "rgb.mkv")
+        video = read_pixels(folder, "rgb")
         rows.append([video[round(time * (len(video) - 1))] for time in SHEET_TIMES])
     names = np.concatenate([_label(record.robot, LABEL_WIDTH, HEIGHT + GAP) for _, record in cells])
     pictures = np.concatenate([names, tile(rows)], 1)
@@ -138,9 +136,9 @@ def contact_sheet(cells: list[tuple[Path, Record]]) -> np.ndarray:
 
 def strip(folder: Path) -> np.ndarray:
     """Eight evenly spaced frames of an episode, with keypoints, over the robot alone: [h w 3] uint8."""
-    rgb, states = read_video(folder / "rgb.mkv"), read_states(folder)
+    rgb, states = read_pixels(folder, "rgb"), read_states(folder)
     is_known = "robot" in read_record(folder).hashes  # imported episodes may have none
-    robot = read_video(folder / "robot.mkv") if is_known else np.full_like(rgb, 255)
+    robot = read_pixels(folder, "robot") if is_known else np.full_like(rgb, 255)
     frames = np.linspace(0, len(rgb) - 1, STRIP_FRAMES).round().astype(int)
     marked = [_mark_robot(rgb[t], states.keypoints[t][states.keypoint_visible[t]], states.robot_mask[t]) for t in frames]
     return tile([marked, [robot[t] for t in frames]])
@@ -164,6 +162,6 @@ def tile(rows: list[list[np.ndarray]]) -> np.ndarray:
 def save_png(path: Path, image: np.ndarray) -> None:
     """Write an image [h w 3] uint8 RGB. Raises EpisodeError if it cannot be written."""
     try:
-        write_bytes(path, encode_png(image))
+        write_bytes(path, encode_png(image), within=path.parent)
     except OSError as error:
         raise EpisodeError(f"cannot write {path}: {error.strerror}. Choose another folder with --pictures.") from error

@@ -5,8 +5,6 @@ A file holds a key of its inputs. Damaged files and files with another key are i
 
 import hashlib
 import threading
-import zipfile
-import zlib
 from dataclasses import fields, replace
 from functools import lru_cache
 from pathlib import Path
@@ -15,7 +13,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from xew.episode import Record, States, array_hash, episode_folder, read_npz
+from xew.episode import Record, States, array_hash, check_forms, episode_folder, read_npz
 from xew.files import digest_files, replacing
 from xew.sim_warp.embodiment.spec import RobotSpec
 from xew.sim_warp.embodiment.urdf import load_urdf
@@ -25,6 +23,18 @@ _SAVING = threading.Lock()
 """Lock for writing: threads may grade the same episode over different frames."""
 CODE = ("embodiment", "geometry", "kinematics", "production", "rendering")
 """Packages whose code, with the stage, determines the tracks."""
+
+
+FORMS = {
+    "pixels": "float32 t p 2",
+    "visible": "bool t p",
+    "body": "int32 p",
+    "shown": "int16 t h w",
+    "is_robot": "bool b",
+    "displacement": "float32 t b",
+    "step": "float32 t b",
+}
+"""Type and shape of each array of `SurfaceTracks`."""
 
 
 def tracks_path(folder: Path, record: Record) -> Path:
@@ -41,17 +51,20 @@ def tracks_key(robot: RobotSpec, scene_hash: str, states: States) -> str:
     return hashlib.sha256("\n".join((*inputs, image, *map(array_hash, arrays))).encode()).hexdigest()
 
 
-def load_tracks(path: Path, key: str) -> SurfaceTracks | None:
-    """The stored tracks with a key, or None."""
+def load_tracks(path: Path, key: str, shape: tuple[int, ...]) -> SurfaceTracks | None:
+    """The stored tracks with a key, of a video with this shape [t h w], or None."""
     try:
         stored = read_npz(path)
         if str(stored["key"]) != key:
             return None
+        check_forms(stored, FORMS)
         arrays: dict[str, Any] = {field.name: stored[field.name] for field in fields(SurfaceTracks)}
-    except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile, zlib.error):
+        names = tuple(str(name) for name in arrays.pop("names"))
+        bodies, count = np.append(arrays["body"], arrays["shown"].max(initial=-1)), len(arrays["is_robot"])
+        whole = arrays["shown"].shape == shape and len(names) == count and -1 <= bodies.min() <= bodies.max() < count
+    except Exception:  # zipfile, zlib and NumPy each have their own
         return None
-    names = tuple(str(name) for name in arrays.pop("names"))
-    return SurfaceTracks(names=names, **arrays)
+    return SurfaceTracks(names=names, **arrays) if whole else None
 
 
 def save_tracks(path: Path, key: str, tracks: SurfaceTracks) -> None:
@@ -59,7 +72,7 @@ def save_tracks(path: Path, key: str, tracks: SurfaceTracks) -> None:
     arrays = {field.name: getattr(tracks, field.name) for field in fields(tracks)}
     arrays["names"] = np.array(tracks.names)
     try:
-        with _SAVING, replacing(path) as temporary, temporary.open("wb") as file:
+        with _SAVING, replacing(path, within=path.parents[3]) as temporary, temporary.open("wb") as file:
             np.savez_compressed(file, key=np.array(key), **arrays)
     except OSError:
         return

@@ -89,7 +89,7 @@ def plan_families(
     families = []
     for task in dict.fromkeys(tasks):
         for name, wanted in wanted_seeds.items():
-            if name == "validation" and not wanted:
+            if name in ("validation", "final") and not wanted:
                 continue
             teams = [(robot,) for robot in robots[name]] if unpaired else [tuple(robots[name])]
             for number, team in enumerate(teams):
@@ -107,4 +107,4 @@ def demand_enough(families: Sequence[Family]) -> None:
         if family.accepted < family.wanted
     ]
     if short:
-        raise EpisodeError("\n".join([*short, "The table shows why; make the task easier or exclude a robot."]))
+        raise EpisodeError(*short, "The table shows why; make the task easier or exclude a robot.")

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 from xew.dataset import count_motions
 from xew.episode import Record
+from xew.names import plain_line
 
 
 def yield_table(records: Sequence[Record]) -> str:
@@ -20,7 +21,7 @@ def yield_table(records: Sequence[Record]) -> str:
     for (task, robot), tried in sorted(cells.items()):
         good = [record for record in tried if record.success]
         frames = sum(record.frame_count for record in good) // max(1, len(good))
-        reasons = Counter(record.failure for record in tried if not record.success)
+        reasons = Counter(plain_line(str(record.failure)) for record in tried if not record.success)
         listed = ", ".join(f"{reason} {count}" for reason, count in reasons.most_common())
         share = f"{len(good)} ({100 * len(good) / len(tried):.0f} %)"
         lines.append(f"{task:<{task_width}} {robot:<{robot_width}} {len(tried):>6}{share:>11}{frames:>8}  {listed}")

@@ -75,7 +75,7 @@ def read_surfaces(folder: Path, keep: Path | None = None) -> SurfaceTracks | Non
     if keep is None:
         return _render_surfaces(robot, scene, states)
     path, key = tracks_path(keep, record), tracks_key(robot, record.scene_hash, states)
-    tracks = load_tracks(path, key)
+    tracks = load_tracks(path, key, states.robot_mask.shape)
     if tracks is None:
         tracks = _render_surfaces(robot, scene, states)
         save_tracks(path, key, tracks)

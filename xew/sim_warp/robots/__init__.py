@@ -10,7 +10,8 @@ from pathlib import Path
 from xew.config import ConfigError, demand_admitted, pick
 from xew.names import EpisodeError, check_name
 from xew.sim_warp.embodiment.spec import Arm, RobotSpec
-from xew.sim_warp.embodiment.urdf import Urdf, UrdfError, load_urdf
+from xew.sim_warp.embodiment.urdf import Urdf, load_urdf
+from xew.sim_warp.embodiment.xml_files import UrdfError
 from xew.sim_warp.robots import aloha_agilex, arx_x5, franka_panda, piper, ur5_wsg
 from xew.sim_warp.robots.procedural.bodies import body_number, load_body
 from xew.sim_warp.robots.user.own import FOLDERS, adopt_robots, is_path, keep_robot, kept_robot, load_robot

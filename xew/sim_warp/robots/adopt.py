@@ -11,9 +11,11 @@ Only this command expands xacro, finds meshes of packages in other folders, conv
 of xew's hands on a bare arm, and gives mirrored arms the same limits.
 """
 
+import re
 import tempfile
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, TypeVar
@@ -25,6 +27,7 @@ from tqdm import tqdm
 from xew.config import ConfigError, user_errors
 from xew.episode import encode_png
 from xew.files import hold_lock, write_bytes
+from xew.names import plain_line
 from xew.sim_warp.devices.workers import quiet_warp
 from xew.sim_warp.embodiment.urdf import Urdf, load_urdf
 from xew.sim_warp.kinematics.reachability import work_reach
@@ -68,13 +71,16 @@ def adopt(args: Args) -> Path:
         EpisodeError: the folder holds other files, or another process writes it.
     """
     source = find_description(args.robot).resolve()
-    draft = RobotDraft(source.name) if source.suffix in (".urdf", ".xacro") else read_draft(source)
-    key = robot_key(source.with_name(source.name.split(".")[0] + ".urdf") if source.suffix == ".xacro" else source)
-    folder = args.out / key
+    is_xacro = source.suffix.lower() == ".xacro"
+    draft = RobotDraft(source.name) if is_xacro else read_draft(source)
+    key = robot_key(source.with_name(source.name.split(".")[0] + ".urdf") if is_xacro else source)
+    folder, described = args.out / key, source.parent / draft.urdf
+    notes: list[str] = []
     with (
         hold_lock(folder),
         tqdm(total=len(STAGES), desc=STAGES[0], unit="stage") as bar,
         tempfile.TemporaryDirectory() as work,
+        _naming(described, work),
     ):
         following = iter(STAGES[1:])
 
@@ -82,24 +88,32 @@ def adopt(args: Args) -> Path:
             bar.update()
             bar.set_description(next(following, STAGES[-1]))
 
-        tree = read_description(source.parent / draft.urdf, _pairs(args.package, Path), _pairs(args.argument, str))
+        tree = read_description(described, _pairs(args.package, Path), _pairs(args.argument, str), notes)
         end_stage()
-        urdf, notes = _normalize(tree, draft, args, Path(work), str(source))
+        urdf, changes = _normalize(tree, draft, args, Path(work) / described.name, str(source))
         end_stage()
         robot = complete_draft(draft, urdf, key, str(source))
-        notes += warning_lines(robot)
+        notes += [*changes, *warning_lines(robot)]
         end_stage()
         problems = check_plans(robot).problems
         end_stage()
         reach = [float(work_reach(robot, arm).mean()) for arm in (0, 1)]
         end_stage()
         write_robot(robot, folder, commented_yaml(robot, draft, urdf_name(robot)))
-        write_bytes(args.out / f"{key}.png", encode_png(view_sheet(nine_views(load_robot(folder)))))
+        write_bytes(args.out / f"{key}.png", encode_png(view_sheet(nine_views(load_robot(folder)))), within=args.out)
         end_stage()
-    print("\n".join(robot_lines(robot, problems, reach)))
-    for note in notes:
-        print(f"note: {note}")
+    for line in [*robot_lines(robot, problems, reach), *(f"note: {note}" for note in dict.fromkeys(notes))]:
+        print(plain_line(line))
     return folder
+
+
+@contextmanager
+def _naming(described: Path, work: str) -> Iterator[None]:
+    """Name the user's file in errors on its changed copies in the folder `work`."""
+    try:
+        yield
+    except ConfigError as error:
+        raise ConfigError(re.sub(rf"{re.escape(work)}/\d+/", f"{described.parent}/", str(error))) from error
 
 
 def view_sheet(views: np.ndarray) -> np.ndarray:
@@ -114,9 +128,9 @@ def _pairs(given: Sequence[str], kind: Callable[[str], Value]) -> dict[str, Valu
     return {name: kind(value) for name, _, value in (text.partition("=") for text in given)}
 
 
-def _normalize(tree: ElementTree.Element, draft: RobotDraft, args: Args, work: Path, source: str) -> tuple[Urdf, list[str]]:
+def _normalize(tree: ElementTree.Element, draft: RobotDraft, args: Args, copy: Path, source: str) -> tuple[Urdf, list[str]]:
     """The robot's URDF with two sliding fingers per hand and equal limits of both arms, and notes on the changes."""
-    urdf, notes = _load(tree, work), []
+    urdf, notes = _load(tree, copy), []
     if args.hand is not None:
         if args.hand not in ROBOTS:
             raise ConfigError(f"--hand {args.hand}: there is no such robot; expected one of {', '.join(ROBOTS)}.")
@@ -124,21 +138,22 @@ def _normalize(tree: ElementTree.Element, draft: RobotDraft, args: Args, work: P
         notes = [graft_hand(tree, urdf, ROBOTS[args.hand], args.last_joint or (joints[-1] if joints else None))]
     elif not draft.arms[0].fingers:
         notes = slide_fingers(tree, urdf)
-    urdf = _load(tree, work) if notes else urdf
+    urdf = _load(tree, copy) if notes else urdf
     left, right = complete_arms(draft, urdf, source)
     if left.joints != right.joints and len(left.joints) == len(right.joints):
         turned = unfold_mirrored(tree, list(zip(left.joints, right.joints, strict=True)), urdf)
         if turned:
             notes.append(f"the axes of {', '.join(turned)} are reversed, because their limits mirror the left arm's")
-            urdf = _load(tree, work)
+            urdf = _load(tree, copy)
     return urdf, notes
 
 
-def _load(tree: ElementTree.Element, work: Path) -> Urdf:
-    """The tree as a URDF, read from a new file: `load_urdf` caches by file."""
-    path = work / f"{len(list(work.iterdir()))}.urdf"
-    ElementTree.ElementTree(tree).write(path, encoding="utf-8", xml_declaration=True)
-    return load_urdf(path)
+def _load(tree: ElementTree.Element, copy: Path) -> Urdf:
+    """The tree as a URDF, read from a file of this name in a new folder: `load_urdf` caches by file."""
+    folder = copy.parent / str(len(list(copy.parent.iterdir())))
+    folder.mkdir()
+    ElementTree.ElementTree(tree).write(folder / copy.name, encoding="utf-8", xml_declaration=True)
+    return load_urdf(folder / copy.name)
 
 
 @user_errors

@@ -15,9 +15,9 @@ import trimesh
 
 from xew.config import ConfigError, parse
 from xew.episode import complete_folder
-from xew.files import cache_folder, read_json
+from xew.files import read_json
 from xew.protocol import BODY_NAME, body_key
-from xew.sim_warp.embodiment import mesh_files, prepared, urdf
+from xew.sim_warp.embodiment import mesh_claims, mesh_files, named_files, prepared, urdf, xml_files
 from xew.sim_warp.embodiment.spec import Arm, RobotSpec
 from xew.sim_warp.embodiment.urdf import prepare
 from xew.sim_warp.geometry import meshes
@@ -115,7 +115,7 @@ def keep_files(body: BodyDesign) -> Path:
     Raises:
         ConfigError: the folder cannot be written.
     """
-    folder = cache_folder("bodies") / content_version() / f"candidate_{body.number}"
+    folder = prepared.bodies_folder() / content_version() / f"candidate_{body.number}"
     path = folder / URDF
     if path.is_file():
         return path
@@ -136,6 +136,7 @@ def keep_files(body: BodyDesign) -> Path:
 def content_version() -> str:
     """Digest of the code and the versions of the libraries that make and read a body's files."""
     digest = hashlib.sha256(f"{np.__version__} {scipy.__version__} {trimesh.__version__}".encode())
-    for module in (design, colors, shapes, urdf_files, solids, mesh_files, meshes, prepared, urdf):
+    readers = (mesh_claims, mesh_files, meshes, named_files, prepared, urdf, xml_files)
+    for module in (design, colors, shapes, urdf_files, solids, *readers):
         digest.update(Path(str(module.__file__)).read_bytes())
     return digest.hexdigest()[:12]

@@ -75,7 +75,7 @@ def find_description(path: Path) -> Path:
     for name in (OWN, ROBOTWIN):
         if (path / name).is_file():
             return path / name
-    urdfs = sorted(path.glob("*.urdf"))
+    urdfs = sorted(file for file in path.iterdir() if file.suffix.lower() == ".urdf" and not file.name.startswith("."))
     if len(urdfs) == 1:
         return urdfs[0]
     content = f"{len(urdfs)} URDFs" if urdfs else "no URDF"
@@ -84,11 +84,12 @@ def find_description(path: Path) -> Path:
 
 def read_draft(description: Path) -> RobotDraft:
     """Read a URDF, a robot.yaml or a RoboTwin config.yml. Raises ConfigError if it is invalid."""
-    if description.suffix == ".urdf":
+    kind = description.suffix.lower()
+    if kind == ".urdf":
         return RobotDraft(description.name)
-    if description.suffix == ".xacro":
+    if kind == ".xacro":
         raise ConfigError(f"{description} is a xacro; python -m xew.sim_warp.robots.adopt {description.name} expands it.")
-    if description.suffix not in (".yaml", ".yml"):
+    if kind not in (".yaml", ".yml"):
         raise ConfigError(f"{description} is no robot; expected a .urdf, a {OWN}, or a folder with a {OWN} or {ROBOTWIN}.")
     content = read_yaml(description)
     if isinstance(content, dict) and "urdf_path" in content:

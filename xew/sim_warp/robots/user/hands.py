@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from xew.config import ConfigError
 from xew.sim_warp.embodiment.spec import RobotSpec
 from xew.sim_warp.embodiment.urdf import Joint, Urdf, load_urdf
+from xew.sim_warp.embodiment.xml_files import read_xml
 from xew.sim_warp.geometry.poses import matrix_from_pose
 from xew.sim_warp.kinematics.forward import joint_motion
 from xew.sim_warp.robots.user.posed import moved_points, nearest_axis, pose_links
@@ -66,7 +67,7 @@ def find_linkages(urdf: Urdf) -> list[Linkage]:
     factors: dict[str, dict[str, tuple[float, float]]] = {}
     for joint in urdf.joints.values():
         name, factor, offset = joint.name, 1.0, 0.0
-        while (mimic := urdf.joints[name].mimic) is not None and mimic[0] in urdf.joints and mimic[0] != joint.name:
+        while (mimic := urdf.joints[name].mimic) is not None:
             name, factor, offset = mimic[0], factor * mimic[1], factor * mimic[2] + offset
         drives = any(other.mimic is not None and other.mimic[0] == joint.name for other in urdf.joints.values())
         if joint.kind != "fixed" and (name != joint.name or drives):
@@ -93,7 +94,8 @@ def _slide(tree: ElementTree.Element, urdf: Urdf, linkage: Linkage, number: int)
     ends = [_finger_points(urdf, linkage, tops, end) for end in (driver.lower, driver.upper)]
     fingers, approach = _choose_fingers(ends[0])
     if len(fingers) < 2:
-        raise ConfigError(f"{urdf.path}: only one finger of the hand on {linkage.base} moves ({driver.name}); {OTHER_HAND}")
+        alone = f"only one finger of the hand on {linkage.base} moves ({driver.name})"
+        raise ConfigError(f"{urdf.path}: {alone}; {OTHER_HAND}{urdf.mimic_hint}")
     gaps = [_tip(end[fingers[0]], approach) - _tip(end[fingers[1]], approach) for end in ends]
     shut = int(np.linalg.norm(gaps[1]) < np.linalg.norm(gaps[0]))
     closed = (driver.lower, driver.upper)[shut]
@@ -101,7 +103,8 @@ def _slide(tree: ElementTree.Element, urdf: Urdf, linkage: Linkage, number: int)
     opening = _on_axis(moves[0] - moves[1], approach)
     stroke = float((moves[0] - moves[1]) @ opening) / 2
     if min(moves[0] @ opening, -moves[1] @ opening) < LEAST_STROKE:
-        raise ConfigError(f"{urdf.path}: the fingers of the hand on {linkage.base} do not both move apart; {OTHER_HAND}")
+        still = f"the fingers of the hand on {linkage.base} do not both move apart"
+        raise ConfigError(f"{urdf.path}: {still}; {OTHER_HAND}{urdf.mimic_hint}")
     middle = (_tip(ends[shut][fingers[0]], approach) + _tip(ends[shut][fingers[1]], approach)) / 2
     frames = pose_links(urdf, linkage.positions(closed))
     for joint in linkage.joints:
@@ -231,7 +234,7 @@ def graft_hand(tree: ElementTree.Element, urdf: Urdf, robot: RobotSpec, last_joi
     turn, _ = Rotation.align_vectors([approach], [tool[:3, 0]])
     pose = np.eye(4)
     pose[:3, :3] = turn.as_matrix()
-    source = ElementTree.parse(theirs.path).getroot()
+    source = read_xml(theirs.path)
     hand_links = {hand, *(link for link in theirs.links if any(joint.parent == hand for joint in theirs.chain(link)))}
     tree.extend(_renamed(material) for material in source.findall("material"))
     tree.extend(_renamed_link(link, theirs) for link in source.findall("link") if link.get("name") in hand_links)
@@ -274,6 +277,7 @@ def _cut_beyond(tree: ElementTree.Element, urdf: Urdf, last: Joint) -> None:
         if last in (chain := urdf.chain(link)) and any(joint.kind != "fixed" for joint in chain[chain.index(last) + 1 :])
     }
     links = [entry for entry in tree.findall("link") if entry.get("name") in gone]
+    tree.extend(material for link in links for material in link.iter("material") if len(material))  # others may name them
     for entry in [*links, *(entry for entry in tree.findall("joint") if _child(entry) in gone)]:
         tree.remove(entry)
 

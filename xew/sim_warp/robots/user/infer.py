@@ -156,6 +156,7 @@ def find_fingers(urdf: Urdf) -> list[tuple[str, str]]:
             f"{urdf.path}: found {len(hands)} hands (a link with two prismatic finger joints), expected one or two. "
             f"python -m xew.sim_warp.robots.adopt {urdf.path.name} converts linked or turning fingers, and its --hand ur5_wsg "
             "mounts a hand; or name the joints in a robot.yaml as arms: [{fingers: [A, B]}, {fingers: [C, D]}]."
+            + urdf.mimic_hint
         )
     poses = pose_links(urdf)
     ordered = sorted(hands, key=lambda hand: -poses[hand][1, 3])

@@ -21,11 +21,13 @@ import yaml
 
 from xew.config import ConfigError
 from xew.episode import complete_folder
-from xew.files import cache_folder, demand_regular, read_json, replacing
+from xew.files import cache_folder, read_json, write_text
 from xew.names import EpisodeError, check_name, path_below
 from xew.protocol import BODY_NAME, ROBOT_NAMES, expand_robots
+from xew.sim_warp.embodiment.named_files import find_file
 from xew.sim_warp.embodiment.spec import RobotSpec
 from xew.sim_warp.embodiment.urdf import Urdf, load_urdf
+from xew.sim_warp.embodiment.xml_files import file_entries, read_xml
 from xew.sim_warp.robots.user.draft import OWN, ArmDraft, Near, RobotDraft, find_description, read_draft
 from xew.sim_warp.robots.user.infer import check_own_motion, complete_arms, complete_limits, fill_right_arm
 
@@ -43,7 +45,7 @@ SEARCH_CODE = ("robots/user", "kinematics", "tasks", "assets", "embodiment", "ge
 
 def is_path(name: str) -> bool:
     """Whether the name of a robot is a path, not a key or module:NAME."""
-    return os.sep in name or name in (".", "..") or name.endswith((".urdf", ".xacro", ".yaml", ".yml"))
+    return os.sep in name or name in (".", "..") or name.lower().endswith((".urdf", ".xacro", ".yaml", ".yml"))
 
 
 def load_robot(path: Path | str) -> RobotSpec:
@@ -66,7 +68,7 @@ def _load(description: Path, modified: int) -> RobotSpec:
 
 def robot_key(description: Path) -> str:
     """The key of a robot: the name of its URDF file or folder; `_own` distinguishes it from xew's robots and bodies."""
-    name = description.stem if description.suffix == ".urdf" else description.parent.name
+    name = description.stem if description.suffix.lower() == ".urdf" else description.parent.name
     key = re.sub(r"[^A-Za-z0-9_-]+", "_", name).strip("_-")
     if not key:
         raise ConfigError(f"{description}: the name {name!r} is no valid key; expected a folder name with letters or digits.")
@@ -154,8 +156,8 @@ def _read_place(path: Path, robot: RobotSpec) -> RobotSpec | None:
 def _keep_place(robot: RobotSpec, path: Path) -> None:
     """Cache bases, homes and tool frames, if the cache folder can be written."""
     arms = [{name: getattr(arm, name) for name in ("root_pose", "home", "tool_pose")} for arm in robot.arms]
-    with contextlib.suppress(OSError), replacing(path) as temporary:
-        temporary.write_text(json.dumps(arms), encoding="utf-8")
+    with contextlib.suppress(OSError):
+        write_text(path, json.dumps(arms), within=path.parent)
 
 
 def _posture(arm: ArmDraft, robot: RobotSpec, source: str) -> np.ndarray | None:
@@ -199,15 +201,16 @@ def _demand_own_files(description: Path, modified: int) -> None:
     folder = description.parent
     path_below(folder.parent, folder.name)
     urdf = path_below(folder, read_draft(path_below(folder, description.name)).urdf)
-    try:
-        named = [mesh.get("filename", "") for mesh in ElementTree.parse(demand_regular(urdf)).iter()]
-    except (OSError, ElementTree.ParseError) as error:
-        raise EpisodeError(f"{urdf} cannot be read as a URDF ({error}); copy the data set again.") from error
-    for name in filter(None, named):
-        path_below(folder, str(urdf.parent.relative_to(folder) / name))
+    for _, entry in file_entries(read_xml(urdf)):  # before any of them is opened
+        if found := find_file(entry.get("filename", ""), urdf.parent):
+            _demand_below(folder, found[0])
     for file in load_urdf(urdf).files:  # materials and textures of meshes
-        if not file.resolve().is_relative_to(folder.resolve()):
-            raise EpisodeError(f"{description} reads {file}, which is not below its folder; copy the data set again.")
+        _demand_below(folder, file)
+
+
+def _demand_below(folder: Path, file: Path) -> None:
+    if not file.resolve().is_relative_to(folder.resolve()):
+        raise EpisodeError(f"the robot {folder} reads {file}, which is not below its folder; copy the data set again.")
 
 
 def _adopt(path: Path, data: Path) -> str:
@@ -222,6 +225,8 @@ def _adopt(path: Path, data: Path) -> str:
             )
         return key
     print(f"robot {key}: completing {description.name}; the result is written to {copy}")
+    for note in load_urdf(description.parent / read_draft(description).urdf).notes:
+        print(f"note: {note}")
     keep_robot(load_robot(path), data, digest)
     return key
 
@@ -251,10 +256,10 @@ def write_robot(robot: RobotSpec, folder: Path, description: str) -> None:
     """
     urdf, name = load_urdf(robot.urdf), urdf_name(robot)
     copies = _copy_names(urdf.files[1:])
-    tree = ElementTree.parse(urdf.path)
-    for entry in [*tree.iter("mesh"), *tree.iter("texture")]:
-        if file := urdf.meshes.get(entry.get("filename", "")):
-            entry.set("filename", copies[file.resolve()].as_posix())
+    root = read_xml(urdf.path)
+    tree = ElementTree.ElementTree(root)
+    for _, entry in file_entries(root):
+        entry.set("filename", copies[urdf.meshes[entry.get("filename", "")].resolve()].as_posix())
     ElementTree.indent(tree)
     with complete_folder(folder, held=(name, FILES, OWN)) as temporary:
         for file, copy in copies.items():

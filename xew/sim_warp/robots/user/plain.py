@@ -1,6 +1,5 @@
 """Normalization of robot descriptions: a URDF or xacro becomes one URDF tree with absolute file names."""
 
-import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
 from pathlib import Path
@@ -8,53 +7,38 @@ from pathlib import Path
 import numpy as np
 
 from xew.config import ConfigError
-from xew.files import read_text
+from xew.sim_warp.embodiment.named_files import find_file, missing_file
 from xew.sim_warp.embodiment.urdf import Urdf
+from xew.sim_warp.embodiment.xml_files import UrdfError, check_elements, file_entries, problem_lines, read_xml
+from xew.sim_warp.robots.user.xacro_files import expand_xacro
 
-NO_XACRO = "is a xacro and needs xacrodoc: python -m pip install xacrodoc. Or pass the expanded URDF."
 
-
-def read_description(path: Path, packages: Mapping[str, Path], arguments: Mapping[str, str]) -> ElementTree.Element:
+def read_description(
+    path: Path, packages: Mapping[str, Path], arguments: Mapping[str, str], notes: list[str] | None = None
+) -> ElementTree.Element:
     """The tree of a .urdf or .xacro with absolute file names, with the folders of packages and a xacro's arguments by name.
 
+    Sentences on files that lie elsewhere than their names say are added to `notes`.
+
     Raises:
-        ConfigError: it cannot be read, or a folder does not exist.
+        ConfigError: it cannot be read, or a file or folder does not exist.
     """
     if missing := [f"{name}={folder}" for name, folder in packages.items() if not folder.is_dir()]:
         raise ConfigError(f"--package {missing[0]}: there is no such folder.")
-    text = _expand(path, packages, arguments) if path.suffix == ".xacro" else read_text(path)
-    try:
-        tree = ElementTree.fromstring(text)
-    except ElementTree.ParseError as error:
-        raise ConfigError(f"{path} is not a URDF that can be read ({error}); fix its XML.") from error
-    for entry in [*tree.iter("mesh"), *tree.iter("texture")]:
-        entry.set("filename", _absolute(entry.get("filename", ""), path.parent, packages))
+    is_xacro = path.suffix.lower() == ".xacro"
+    tree = check_elements(expand_xacro(path, packages, arguments) if is_xacro else read_xml(path), path)
+    problems = []
+    for who, entry in file_entries(tree):
+        name = entry.get("filename", "")
+        if (found := find_file(name, path.parent, packages)) is None:
+            problems.append(missing_file(path, who, name))
+        else:
+            entry.set("filename", str(found[0].resolve()))
+            if notes is not None and found[1]:
+                notes.append(found[1])
+    if problems:
+        raise UrdfError(*problem_lines(path, problems))
     return tree
-
-
-def _expand(path: Path, packages: Mapping[str, Path], arguments: Mapping[str, str]) -> str:
-    """The expanded text of a xacro."""
-    try:
-        from xacrodoc import XacroDoc
-        from xacrodoc import packages as finder
-    except ImportError as error:
-        raise ConfigError(f"{path} {NO_XACRO}") from error
-    finder.update_package_cache({name: str(folder.resolve()) for name, folder in packages.items()})
-    try:
-        document = XacroDoc.from_file(str(path), subargs=dict(arguments), resolve_packages=False)
-        return str(document.to_urdf_string())
-    except Exception as error:  # xacro and xacrodoc raise many kinds
-        reason = " ".join(str(error).split()) or type(error).__name__
-        advice = "check --package NAME=DIR and --argument NAME=VALUE"
-        raise ConfigError(f"{path} cannot be expanded ({reason}); {advice}.") from error
-
-
-def _absolute(name: str, folder: Path, packages: Mapping[str, Path]) -> str:
-    """The absolute name of a file in its package or next to the description; other names are unchanged."""
-    if (inside := re.fullmatch(r"package://([^/]+)/(.*)", name)) and inside[1] in packages:
-        return str((packages[inside[1]] / inside[2]).resolve())
-    local = folder / name.removeprefix("file://")
-    return str(local.resolve()) if local.is_file() else name
 
 
 def unfold_mirrored(tree: ElementTree.Element, pairs: list[tuple[str, str]], urdf: Urdf) -> list[str]:
