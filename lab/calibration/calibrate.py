@@ -14,6 +14,7 @@ Predictors: videos made on purpose, from the true one to a gray one, and whether
     python -m lab.calibration --data data --predictors --out calibration
 """
 
+import functools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations, zip_longest
@@ -36,7 +37,7 @@ from xew.metrics import METRICS
 from xew.metrics.backends import Masker, Tracker, open_masker, open_tracker
 from xew.metrics.episode_cache import EpisodeCache
 from xew.metrics.grade import Comparison, Grades, grade, input_kind
-from xew.metrics.grading.codecs import open_codec
+from xew.metrics.grading.codecs import ModelCodec, open_codecs
 from xew.metrics.truth import NEEDS, Truth, read_truth
 from xew.protocol import seed_split
 
@@ -108,27 +109,27 @@ def main(args: Args) -> None:
         near = suggestion(unknown[0], PREDICTORS)
         raise ConfigError(f"unknown predictor {unknown[0]!r};{near} known: {', '.join(PREDICTORS)}: --cases.")
     estimators = Estimators(open_masker(args.masks, args.masks_checkpoint), open_tracker(args.tracks, args.tracks_checkpoint))
-    through_codec = None if args.codec is None else open_codec(args.codec)
+    codec = None if args.codec is None else next(iter(open_codecs((args.codec,)).values()))
     episodes = find_accepted(args.data)
     demand_one_motion(args.data, (record for _, record in episodes))
     with hold_lock(args.out):
         if args.predictors:
             print(grade_matrix(episodes, args, estimators))
         else:
-            print(grade_references(episodes, args, estimators, through_codec))
+            print(grade_references(episodes, args, estimators, codec))
 
 
 def grade_references(
     episodes: Sequence[Episode],
     args: Args,
     estimators: Estimators,
-    through_codec: Callable[[np.ndarray], np.ndarray] | None,
+    codec: ModelCodec | None,
 ) -> str:
     """Grade references and wrong motions on the chosen episodes, write rows and both tables, and return these in Markdown."""
     tables = {name: pd.DataFrame() for name in ("references", "wrong", "frames")}
     text = ""
     for episode in tqdm(choose(episodes, args), desc="calibrate", unit="episode", disable=None):
-        for name, table in calibrate(episode, episodes, estimators, through_codec).items():
+        for name, table in calibrate(episode, episodes, estimators, codec).items():
             tables[name] = pd.concat([tables[name], table], ignore_index=True)
         text = report(**tables)
         write(args.out, text, tables)  # each time, so a stopped run has written something
@@ -152,7 +153,7 @@ def calibrate(
     episode: Episode,
     episodes: Sequence[Episode],
     estimators: Estimators,
-    through_codec: Callable[[np.ndarray], np.ndarray] | None = None,
+    codec: ModelCodec | None = None,
 ) -> dict[str, pd.DataFrame]:
     """The rows of one of the episodes: references (KEY metric value), wrong (KEY metric estimate truth), frames (by frame)."""
     folder, record = episode
@@ -161,6 +162,7 @@ def calibrate(
     references: list[Row] = []
     wrong: list[Row] = []
     frames: list[pd.DataFrame] = []
+    through_codec = None if codec is None else functools.partial(codec.reconstruct, folder)
     for case, video in reference_videos(episodes, record, truth, through_codec):
         values = estimators.grade(video, truth, tuple(METRICS)).values
         references += [key | {"case": case, "metric": name, "value": value} for name, value in values.items()]
@@ -268,15 +270,15 @@ def report(references: pd.DataFrame, wrong: pd.DataFrame, frames: pd.DataFrame) 
         f"Means over {episodes} episodes: {', '.join(sorted(wrong['task'].unique()))}; robots "
         f"{', '.join(sorted(wrong['robot'].unique()))}.",
         "### References",
-        _markdown(reference_table(references)),
+        as_markdown(reference_table(references)),
         "### Wrong appearance: error of found points [px] (share that was found), of the robot; of objects; mask IoU",
-        _markdown(appearance_table(references)),
+        as_markdown(appearance_table(references)),
         "### Wrong motions: estimate (truth)",
-        _markdown(wrong_table(wrong, frames)),
+        as_markdown(wrong_table(wrong, frames)),
         "### Wrong motions, frame by frame: mean difference of the estimate from the truth (mean of its absolute value)",
-        _markdown(motion_table(frames)),
+        as_markdown(motion_table(frames)),
         "### Order",
-        _markdown(order_table(wrong)),
+        as_markdown(order_table(wrong)),
     ]
     return "\n\n".join(parts) + "\n"
 
@@ -287,17 +289,21 @@ def reference_table(references: pd.DataFrame) -> pd.DataFrame:
     return table.loc[list(METRICS), list(references["case"].unique())].map("{:.3f}".format)
 
 
-def appearance_table(references: pd.DataFrame) -> pd.DataFrame:
-    """What the estimators make of each robot (columns) in the true motion and each wrong appearance (rows)."""
-    cases = [case for case in ("truth itself", *APPEARANCES) if case in set(references["case"])]
-    means = references.groupby(["case", "robot", "metric"])["value"].mean().unstack()
+def appearance_table(rows: pd.DataFrame) -> pd.DataFrame:
+    """What the estimators make of each robot (columns) in the true motion and each wrong appearance (rows).
+
+    Args:
+        rows: task, seed, robot, case, metric and value, of references or of predictors.
+    """
+    cases = [case for case in ("truth itself", "truth", *APPEARANCES) if case in set(rows["case"])]
+    means = rows.groupby(["case", "robot", "metric"])["value"].mean().unstack()
     cell = (
         "{keypoint_error_found:.2f} ({coverage_strict:.2f}); {trajectory_error_found:.2f} ({object_coverage_strict:.2f}); "
         "{mask_iou:.3f}"
     )
-    robots = sorted(set(references["robot"]))
-    rows = {case: [cell.format(**means.loc[(case, robot)]) for robot in robots] for case in cases}
-    return pd.DataFrame.from_dict(rows, orient="index", columns=robots)
+    robots = sorted(set(rows["robot"]))
+    cells = {case: [cell.format(**means.loc[(case, robot)]) for robot in robots] for case in cases}
+    return pd.DataFrame.from_dict(cells, orient="index", columns=robots)
 
 
 def wrong_table(wrong: pd.DataFrame, frames: pd.DataFrame) -> pd.DataFrame:
@@ -347,7 +353,7 @@ def _keeps_order(table: pd.DataFrame, apart: float) -> Iterator[bool]:
             yield bool((a["truth"] - b["truth"]) * (a["estimate"] - b["estimate"]) > 0)
 
 
-def _markdown(table: pd.DataFrame) -> str:
+def as_markdown(table: pd.DataFrame) -> str:
     """A table of texts, its index first."""
     lines = [["", *map(str, table.columns)], ["---"] * (1 + len(table.columns))]
     lines += [[str(name), *map(str, row)] for name, row in zip(table.index, table.to_numpy(), strict=True)]

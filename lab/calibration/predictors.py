@@ -29,9 +29,12 @@ NOISE_SEED = 0
 BRIGHTER = 12.0
 """Offset [levels] of what is brighter."""
 DARKER = 0.8
+CONTRAST = 1.2
 TINT = (1.0, 0.9, 0.8)
 RECOLORED = (0.4, 0.5, 0.9)
-"""Gains of what is darker, tinted, and recolored."""
+"""Gains of what is darker, of more contrast, tinted, and recolored."""
+MIDDLE = 128
+"""Level that more contrast leaves as it is."""
 GRAIN = 4.0
 BLANK_STEP = 5
 ASIDE = 60
@@ -158,6 +161,7 @@ PREDICTORS: dict[str, Callable[[Material], np.ndarray | None]] = {
     "grain": lambda m: add_grain(m.truth),
     "brighter": lambda m: expose(m.truth, offset=BRIGHTER),
     "darker": lambda m: expose(m.truth, DARKER),
+    "contrast": lambda m: expose(m.truth, CONTRAST, MIDDLE * (1 - CONTRAST)),
     "tinted": lambda m: expose(m.truth, TINT),
     "robot recolored": lambda m: recolor(m.truth, m.robot),
     "object recolored": lambda m: recolor(m.truth, m.objects),
@@ -184,7 +188,7 @@ PREDICTORS: dict[str, Callable[[Material], np.ndarray | None]] = {
 softened as `evaluate` shows it to its estimators, since no prediction is ever the very video that it is compared with."""
 
 
-APPEARANCES = ("blur", "grain", "brighter", "darker", "tinted", "robot recolored", "object recolored")
+APPEARANCES = ("blur", "grain", "brighter", "darker", "contrast", "tinted", "robot recolored", "object recolored")
 """Names of predictors with the true motion and another appearance."""
 
 

@@ -5,7 +5,6 @@ Each needs the ground truth of a simulator, and no network's weights.
 """
 
 import functools
-from collections.abc import Callable
 from typing import TypeAlias
 
 import jax
@@ -144,13 +143,12 @@ def ghosts(prediction: Video, target: Video, target_mask: Masks, *, chunk: int |
 
     def of_frames(frames: tuple[jax.Array, ...]) -> jax.Array:
         seen, true, mask = frames
-        scene = 1 - _pool(_grow(mask), lax.max)
-        difference = _pool(_levels(seen) - _levels(true), lax.add) / 4
-        weight = scene[..., None]
-        area = jnp.maximum(jnp.sum(scene, axis=(1, 2)), 1)[:, None, None, None]
-        exposure = jnp.sum(weight * jnp.clip(difference, -EXPOSURE, EXPOSURE), axis=(1, 2), keepdims=True) / area
+        scene = ~jnp.any(_cells(_grow(mask)), axis=(2, 4))
+        difference = jnp.mean(_cells(_levels(seen) - _levels(true)), axis=(2, 4))
+        exposure = _mean_where(jnp.clip(difference, -EXPOSURE, EXPOSURE), scene[..., None])
         shown = jnp.max(jnp.abs(difference - exposure), axis=-1) > GHOST
-        return jnp.where(_is_broken(seen, true), jnp.nan, jnp.mean(jnp.where(shown, scene, 0), axis=(1, 2)))
+        share = jnp.mean((shown & scene).astype(jnp.float32), axis=(1, 2))
+        return jnp.where(_is_broken(seen, true), jnp.nan, share)
 
     return map_chunks(of_frames, (prediction, target, jnp.asarray(target_mask)), chunk)
 
@@ -314,8 +312,16 @@ def _mean_change(change: jax.Array, where: jax.Array, broken: jax.Array) -> tupl
 
 
 def _is_broken(*frames: jax.Array) -> jax.Array:
-    """[n] bool, whether a number in any of some frames [n h w 3] is NaN."""
-    return functools.reduce(jnp.logical_or, (jnp.any(jnp.isnan(_levels(one)), axis=(1, 2, 3)) for one in frames))
+    """[n] bool, whether a number in any of some frames [n h w 3] is NaN; bytes never are."""
+    if frames[0].dtype == jnp.uint8:
+        return jnp.zeros(len(frames[0]), bool)
+    return functools.reduce(jnp.logical_or, (jnp.any(jnp.isnan(one), axis=(1, 2, 3)) for one in frames))
+
+
+def _mean_where(values: jax.Array, where: jax.Array) -> jax.Array:
+    """Mean [n 1 1 c] of values [n h w c] where [n h w 1]; 0 where there is none."""
+    count = jnp.maximum(jnp.sum(where, axis=(1, 2), keepdims=True), 1).astype(jnp.float32)
+    return jnp.sum(jnp.where(where, values, 0), axis=(1, 2), keepdims=True) / count
 
 
 def _counting_pairs(values_and_counts: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
@@ -325,12 +331,14 @@ def _counting_pairs(values_and_counts: tuple[jax.Array, jax.Array]) -> tuple[jax
 
 
 def _grow(mask: jax.Array) -> jax.Array:
-    """A mask [n h w] bool grown by GHOST_MARGIN on all sides, float32."""
-    window = (1, 2 * GHOST_MARGIN + 1, 2 * GHOST_MARGIN + 1)
-    return lax.reduce_window(mask.astype(jnp.float32), np.float32(0), lax.max, window, (1, 1, 1), "same")
+    """A mask [n h w] bool grown by GHOST_MARGIN on all sides, along one axis after the other."""
+    size = 2 * GHOST_MARGIN + 1
+    for window in ((1, size, 1), (1, 1, size)):
+        mask = lax.reduce_window(mask, False, lax.bitwise_or, window, (1, 1, 1), "same")
+    return mask
 
 
-def _pool(image: jax.Array, join: Callable[..., jax.Array]) -> jax.Array:
-    """An image [n h w] or [n h w c] in cells of 2x2 pixels, joined by `lax.add` or `lax.max`; odd rests are left out."""
-    window = (1, 2, 2, *(1,) * (image.ndim - 3))
-    return lax.reduce_window(image, np.float32(0), join, window, window, "valid")
+def _cells(image: jax.Array) -> jax.Array:
+    """An image [n h w ...] in cells of 2x2 pixels [n h/2 2 w/2 2 ...]; odd rests are left out."""
+    n, h, w = image.shape[0], image.shape[1] // 2, image.shape[2] // 2
+    return image[:, : 2 * h, : 2 * w].reshape(n, h, 2, w, 2, *image.shape[3:])

@@ -42,16 +42,12 @@ def exact(prediction: np.ndarray, target: np.ndarray, points: np.ndarray, visibl
     return np.where(visible[..., None], points, np.nan).astype(np.float32)
 
 
-OF_ONE_FAULT = {
-    "flicker",
-    "flicker_robot",
-    "ghosts",
-    "gripper_error",
-    "trajectory_error_found",
-    "final_object_error",
-    "onset_shift",
-}
-"""Metrics that a late video may not be worse by than a frozen one."""
+OF_OBJECTS = {"trajectory_error", "trajectory_error_strict", "trajectory_error_found"}
+COVERAGES = {"coverage", "coverage_strict", "object_coverage", "object_coverage_strict"}
+NOT_BY_DELAY = OF_OBJECTS | COVERAGES | {"flicker", "flicker_robot"}
+"""Metrics that do not say how late a video is: the disc hardly moves in a frame, all is found, and a frozen video is steady."""
+UNDEFINED = {"gripper_error", "onset_shift", "final_object_error"}
+"""Metrics of which these episodes have nothing: no finger, hardly a motion, an object that is hidden at the end."""
 SHIFTED = Backend(lambda: shifted, None, "for tests")
 EXACT = Backend(lambda: exact, None, "for tests")
 
@@ -151,20 +147,14 @@ def test_all_four_dimensions_with_baselines_by_default(rollouts: Path, data: Pat
     scores = pd.read_parquet(rollouts.parent / "scores.parquet")
     assert set(scores["model"]) == {"late", *BASELINES}
     whole = scores[scores["model"] != OTHER_ROBOT]  # of which no keypoint may be found where this robot's are
-    undefined = {
-        "gripper_error",
-        "onset_shift",
-        "final_object_error",
-    }  # no finger, hardly a motion, hidden at the end
-    assert set(whole["metric"]) == set(METRICS) - undefined
-    assert len(whole) == len(BASELINES) * len(ROBOTS) * (len(METRICS) - len(undefined))
+    assert set(whole["metric"]) == set(METRICS) - UNDEFINED
+    assert len(whole) == len(BASELINES) * len(ROBOTS) * (len(METRICS) - len(UNDEFINED))
     described = scores.attrs["metrics"]
     assert list(described) == list(METRICS)
     assert {info["dimension"] for info in described.values()} == {"visual", "morphology", "kinematics", "objects"}
     for robot in ROBOTS:
         for name, info in described.items():
-            # all is found; the disc hardly moves in a frame
-            if name.removesuffix("_strict") in ("coverage", "object_coverage", "trajectory_error") or name in OF_ONE_FAULT:
+            if name in UNDEFINED | NOT_BY_DELAY:
                 continue
             frozen, model, perfect = (value(scores, m, robot, name) for m in ("copy_first_frame", "late", "ground_truth"))
             sign = 1 if info["higher_is_better"] else -1
@@ -215,7 +205,7 @@ def test_a_gray_video_is_worst_in_the_strict_suite_and_missing_in_the_papers(dat
     assert not lost & set(gray["metric"])
     failures = ("keypoint_error_strict", "trajectory_error_strict")
     worst = dict.fromkeys(failures, failure_distance()) | dict.fromkeys(("ndtw", "ndtw_strict"), 0.5)
-    for name in set(names) - lost - {"gripper_error", "onset_shift", "final_object_error"}:
+    for name in set(names) - lost - UNDEFINED:
         for robot in ROBOTS:
             assert value(scores, "gray", robot, name) == pytest.approx(worst.get(name, 0), rel=1e-5)
 

@@ -113,14 +113,14 @@ def take_colors(target: np.ndarray, prediction: np.ndarray, labels: np.ndarray) 
 
 def _find_color_maps(target: np.ndarray, prediction: np.ndarray, labels: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
     """Bodies that have other colors in the first frames, each with the map [4 3] from their true colors and one."""
-    for body in set(np.unique(labels)) - {REST}:
+    for body in range(labels.max(initial=REST) + 1):
         shows = np.flatnonzero(np.count_nonzero(labels[1:] == body, axis=(1, 2)) >= SHOWN) + 1
         spread = np.unique(np.linspace(0, max(len(shows) - 1, 0), min(SPREAD_FRAMES, len(shows))).round().astype(int))
         for chosen in (spread, [i for i in FIRST_FRAMES if i < len(shows)]):
             frames = shows[chosen]
             color_map = _find_color_map(target[frames], prediction[frames], labels[frames] == body)
             if color_map is not None:
-                yield int(body), color_map
+                yield body, color_map
                 break
 
 
