@@ -307,21 +307,22 @@ def _compare_tracks(
     names: tuple[str, ...], arrays: list[jax.Array], options: dict[str, jax.Array]
 ) -> tuple[dict[str, jax.Array], dict[str, jax.Array]]:
     """Metrics of tracks by name, as one program: scalars, and [t] of each frame alone, NaN where it has nothing to compare."""
-
-    def score(name: str, arrays: list[jax.Array], options: dict[str, jax.Array]) -> jax.Array:
-        metric = METRICS[name]
-        return metric.function(*arrays, **{option: options[option] for option in metric.options})
-
+    values = {name: _score(name, arrays, options) for name in names}
     frames = [array[:, None] for array in arrays]
-    by_frame = {"diagonal": options["diagonal"][:, None], "frames": jnp.ones(len(frames[0]), jnp.int32)}
-
-    def score_frame(name: str, frame: list[jax.Array], own: dict[str, jax.Array]) -> jax.Array:
-        return score(name, frame, options | own)
-
+    of_frames = options | {"diagonal": options["diagonal"][:, None], "frames": jnp.int32(1)}
+    axes = {name: 0 if name == "diagonal" else None for name in of_frames}
     curves = {
-        name: jax.vmap(functools.partial(score_frame, name))(frames, by_frame) for name in names if not METRICS[name].whole
+        name: jax.vmap(functools.partial(_score, name), in_axes=(0, axes))(frames, of_frames)
+        for name in names
+        if not METRICS[name].whole
     }
-    return {name: score(name, arrays, options) for name in names}, curves
+    return values, curves
+
+
+def _score(name: str, arrays: list[jax.Array], options: dict[str, jax.Array]) -> jax.Array:
+    """The scalar of a metric of tracks, with those of the options that its function takes."""
+    metric = METRICS[name]
+    return metric.function(*arrays, **{option: options[option] for option in metric.options})
 
 
 def _mean_of_known(curve: np.ndarray) -> float:

@@ -78,26 +78,38 @@ def _find_exposure(frame: np.ndarray, true_frame: np.ndarray, still: np.ndarray)
     """Levels [1 256 3] uint8 of the true exposure for those of a frame [h w 3]; None where it is the same, or no exposure."""
     if np.array_equal(frame, true_frame):
         return None
-    seen, true = (cv2.resize(image, THUMBNAIL, interpolation=cv2.INTER_AREA) for image in (frame, true_frame))
-    kept = cv2.resize(still.astype(np.uint8), THUMBNAIL, interpolation=cv2.INTER_AREA) > 0
-    x, y = seen[kept].astype(np.float32), true[kept].astype(np.float32)
+    seen, true, kept = (_shrink(image) for image in (frame, true_frame, still.astype(np.uint8)))
+    x, y = (image[kept > 0].astype(np.float32) for image in (seen, true))
     if len(x) < FEWEST:
         return None
-    spread_x, spread_y = (np.diff(np.percentile(values, (10, 90), axis=0), axis=0)[0] for values in (x, y))
-    gain = np.clip(spread_y / np.maximum(spread_x, 1), *GAINS)
-    evened = gain * x + np.median(y, axis=0) - gain * np.median(x, axis=0)
-    inlier = np.abs(evened - y).max(axis=1) < INLIER
+    inlier = _find_inliers(x, y)
     if inlier.mean() < AGREEMENT:
         return None
     x, y = x[inlier], y[inlier]
-    centered = x - x.mean(axis=0)
-    gain = np.clip((centered * y).sum(axis=0) / np.maximum((centered**2).sum(axis=0), 1), *GAINS)
-    evened = gain * centered + y.mean(axis=0)
-    before = np.abs(y - x).mean()
-    if before < VISIBLE or np.abs(evened - y).mean() > AGREEMENT * before:
+    gain = _fit_gain(x, y)
+    before, after = (np.abs(some - y).mean() for some in (x, gain * (x - x.mean(axis=0)) + y.mean(axis=0)))
+    if before < VISIBLE or after > AGREEMENT * before:
         return None
     levels = gain * (np.arange(256)[:, None] - x.mean(axis=0)) + y.mean(axis=0)
     return np.clip(np.rint(levels), 0, 255).astype(np.uint8)[None]
+
+
+def _shrink(image: np.ndarray) -> np.ndarray:
+    return cv2.resize(image, THUMBNAIL, interpolation=cv2.INTER_AREA)
+
+
+def _find_inliers(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """[n] bool, which colors [n 3] the exposure explains that maps the middle and the spread of all."""
+    spread_x, spread_y = (np.diff(np.percentile(values, (10, 90), axis=0), axis=0)[0] for values in (x, y))
+    gain = np.clip(spread_y / np.maximum(spread_x, 1), *GAINS)
+    evened = gain * x + np.median(y, axis=0) - gain * np.median(x, axis=0)
+    return np.abs(evened - y).max(axis=1) < INLIER
+
+
+def _fit_gain(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Gains [3] by least squares that take colors [n 3] to others, both about their means."""
+    centered = x - x.mean(axis=0)
+    return np.clip((centered * y).sum(axis=0) / np.maximum((centered**2).sum(axis=0), 1), *GAINS)
 
 
 def take_colors(target: np.ndarray, prediction: np.ndarray, labels: np.ndarray) -> np.ndarray:
