@@ -10,14 +10,24 @@ import pytest
 
 from lab.calibration.calibrate import appearance_table, as_markdown
 from lab.calibration.matrix import OWN_PAIRS, expected_order, grade_material, matrix, order_violations, to_markdown
-from lab.calibration.predictors import BELOW, PREDICTORS, Material, erase_objects, hold_objects, predict, soften
+from lab.calibration.predictors import (
+    BELOW,
+    PREDICTORS,
+    Material,
+    erase_objects,
+    fail_at_end,
+    hold_objects,
+    open_grippers,
+    predict,
+    soften,
+)
 from tests.metrics.test_functions import AT_MOST
 from tests.synthetic import write_synthetic_data
 from xew.episode import States, read_states
 from xew.metrics import METRICS
 from xew.metrics.backends import open_masker, open_tracker
 from xew.metrics.truth import MOVED, Points, Surfaces, Truth
-from xew.protocol import GRADING_PROTOCOL, HELD_OUT_ROBOTS, SEEN_ROBOTS
+from xew.protocol import ARMS, GRADING_PROTOCOL, HELD_OUT_ROBOTS, SEEN_ROBOTS
 from xew.sim_warp.tasks import TASKS
 
 FRAMES, HEIGHT, WIDTH = 41, 96, 128
@@ -237,6 +247,34 @@ def test_predictors_are_what_they_are_called() -> None:
     assert 0 < off["truth"] < off["blur"] and 0 < off["codec"] < 0.3 * off["noise"]
     for name in ("codec", "shuffled", "noise"):
         np.testing.assert_array_equal(predict(name, material), videos[name], err_msg=f"{name} is the same every time")
+
+
+def test_predictors_of_one_fault_have_that_fault_alone() -> None:
+    truth = rng.integers(30, 200, (12, 20, 90, 3), dtype=np.uint8)
+    robot, objects = np.zeros((2, *truth.shape[:3]), bool)
+    robot[:, :8, :10], objects[:, 12:, 40:60] = True, True
+    videos = {name: predict(name, Material(truth, robot=robot, objects=objects)) for name in PREDICTORS}
+    levels = truth[1:].astype(int)
+    np.testing.assert_array_equal(videos["brighter"][1:], levels + 12)
+    np.testing.assert_array_equal(videos["contrast"][1:], np.rint(128 + 1.2 * (levels - 128)))
+    np.testing.assert_array_equal(videos["flicker"][::2], truth[::2])
+    np.testing.assert_array_equal(videos["flicker"][1::2], truth[1::2] + np.uint8(12))
+    np.testing.assert_array_equal(videos["jitter"][2, :, 1:], truth[2, :, :-1])
+    np.testing.assert_array_equal(videos["8 frames early"][1:4], truth[9:12])
+    for name, own in (("robot recolored", robot), ("object recolored", objects)):
+        np.testing.assert_array_equal((videos[name] != truth).any(axis=-1)[1:], own[1:])
+    np.testing.assert_array_equal((videos["ghost"] != truth).any(axis=(0, 1, 3)), np.arange(90) // 10 == 6)
+    blank = (videos["every 5th blank"] == 128).all(axis=(1, 2, 3))
+    np.testing.assert_array_equal(np.flatnonzero(blank), [5, 10])
+
+
+def test_a_task_fails_at_the_end_and_grippers_are_open(states: States) -> None:
+    failed, opened = fail_at_end(states), open_grippers(states)
+    np.testing.assert_array_equal(failed.object_pose[:14], states.object_pose[:14])
+    assert (failed.object_pose[14:] == states.object_pose[0]).all() and (failed.joint_pos == states.joint_pos).all()
+    grippers = [gripper for _, gripper in ARMS]
+    arms = np.delete(np.arange(states.joint_pos.shape[1]), grippers)
+    assert (opened.joint_pos[1:, grippers] == 1).all() and (opened.joint_pos[:, arms] == states.joint_pos[:, arms]).all()
 
 
 def test_objects_are_held_or_taken_away_from_where_they_begin_to_move(states: States) -> None:
