@@ -14,8 +14,7 @@ Predictors: videos made on purpose, from the true one to a gray one, and whether
     python -m lab.calibration --data data --predictors --out calibration
 """
 
-import functools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations, zip_longest
 from pathlib import Path
@@ -162,8 +161,7 @@ def calibrate(
     references: list[Row] = []
     wrong: list[Row] = []
     frames: list[pd.DataFrame] = []
-    through_codec = None if codec is None else functools.partial(codec.reconstruct, folder)
-    for case, video in reference_videos(episodes, record, truth, through_codec):
+    for case, video in reference_videos(episodes, episode, truth, codec):
         values = estimators.grade(video, truth, tuple(METRICS)).values
         references += [key | {"case": case, "metric": name, "value": value} for name, value in values.items()]
     for case, wrong_motion in render_perturbations(folder):
@@ -202,13 +200,14 @@ def _take_turns(episodes: Sequence[Episode]) -> list[Episode]:
 
 
 def reference_videos(
-    episodes: Sequence[Episode], record: Record, truth: Truth, through_codec: Callable[[np.ndarray], np.ndarray] | None
+    episodes: Sequence[Episode], episode: Episode, truth: Truth, codec: ModelCodec | None
 ) -> Iterator[tuple[str, np.ndarray]]:
     """Videos to grade as predictions of an episode, by the name of the case, each uint8 [t h w 3]."""
+    folder, record = episode
     frames = np.arange(len(truth.rgb))
     yield "truth itself", truth.rgb
-    if through_codec is not None:
-        yield "truth through the codec", through_codec(truth.rgb)
+    if codec is not None:
+        yield "truth through the codec", codec.reconstruct(folder, truth.rgb)
     yield "frozen first frame", truth.rgb[np.zeros_like(frames)]
     yield f"truth {LATE} frames late", truth.rgb[np.maximum(frames - LATE, 0)]
     material = Material(truth.rgb, robot=truth.labels == 0, objects=truth.labels > 0)
@@ -217,9 +216,9 @@ def reference_videos(
         if video is not None:
             yield case, video
     for differs in ("robot", "seed"):
-        folder = find_another(episodes, record, differs)
-        if folder is not None:
-            video = read_pixels(folder, "rgb")
+        other = find_another(episodes, record, differs)
+        if other is not None:
+            video = read_pixels(other, "rgb")
             yield f"another {differs}", video[np.minimum(frames, len(video) - 1)]
 
 

@@ -21,6 +21,7 @@ from lab.calibration.predictors import (
     predict,
     soften,
 )
+from tests.metrics.test_functions import AT_MOST
 from tests.synthetic import write_synthetic_data
 from xew.episode import States, read_states
 from xew.metrics import METRICS
@@ -41,8 +42,12 @@ FURTHER = Path(__file__).with_name("erased.parquet")
 """Object errors of objects at rest and erased on the same seed of the other tasks, with the PiPER (`calibrate --cases`)."""
 APPEARANCE = Path(__file__).with_name("appearance.parquet")
 """Rows of the true motion in another exposure or color on the same seed of four tasks, with all five robots."""
-ACCEPTANCE_TASKS = ("place_empty_cup", "grab_roller", "open_laptop")
-"""A task of placing, one with two arms, and an articulated object."""
+ACCEPTANCE_TASKS = ("place_empty_cup", "grab_roller", "open_laptop", "stack_bowls_two")
+"""A task of placing, one with two arms, an articulated object, and one of stacking."""
+WORST = Path(__file__).with_name("worst.parquet")
+"""Rows of twelve predictors of one episode, open_laptop with Franka, in which the tracker once erred most."""
+NOISE = {"px": 1.0, "levels": 0.1}
+"""Differences, by unit, up to which the truth may be worse than another predictor."""
 PAGE = Path(__file__).parents[3] / "docs" / "metrics.md"
 NOT_ORDERED: dict[str, list[tuple[str, str]]] = {
     "psnr": [("brighter", "every 5th blank"), ("object recolored", "object erased")],
@@ -217,8 +222,18 @@ def test_the_page_of_calibration_shows_the_measured_appearances() -> None:
     assert as_markdown(appearance_table(read_rows(APPEARANCE))) in page
 
 
+def test_the_worst_episode_has_scores_in_their_ranges_and_the_truth_is_best() -> None:
+    table = matrix(read_rows(WORST))
+    for name, values in table.iterrows():
+        metric = METRICS[str(name)]
+        low, high = metric.range
+        assert values.dropna().between(low, AT_MOST.get(str(name), high) * (1 + 1e-6)).all(), values
+        sign = 1 if metric.higher_is_better else -1
+        assert (sign * values["truth"] >= sign * values.drop("truth").dropna() - NOISE.get(metric.unit, 0.002)).all(), values
+
+
 def test_erasing_what_moves_is_worse_than_leaving_it_in_every_task(measured: pd.DataFrame) -> None:
-    rows = pd.concat([measured, pd.read_parquet(FURTHER)]).query("metric == 'trajectory_error_strict'")
+    rows = pd.concat([measured, read_rows(FURTHER)]).query("metric == 'trajectory_error_strict'")
     errors = rows.pivot_table(index=["task", "robot"], columns="case", values="value")
     assert set(errors.index.get_level_values("task")) == set(TASKS)
     assert (errors["object erased"] > errors["object at rest"]).all(), errors[["object at rest", "object erased"]]
