@@ -9,6 +9,7 @@ from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Bool, Float32, Int
 
@@ -44,7 +45,10 @@ LAST_SHARE = 10
 MOVED = 4.0
 """Distance [pixels of TAPVID_SIDE] from its first place from which on a point has moved."""
 LASTING = 8
-"""Number of frames that a motion lasts to count as begun."""
+"""Number of frames, half a second, that a motion lasts to count as begun."""
+MOST_MOVED, FEWEST_FOUND = 0.75, 0.25
+"""Least share of an object's found points that have moved in these frames, and of its visible points that are found: lost
+points neither make nor interrupt a motion."""
 LATEST = 16
 """Largest shift of an onset [frames], about a second, which a motion that never begins has."""
 
@@ -197,8 +201,8 @@ def onset_shift(
 ) -> Scalar:
     """Number of frames between an object's true and predicted first motion, early or late, mean over objects; 0 is best.
 
-    An object moves from the frame on in which most of its visible points are found 4 px of 256 from their true first places,
-    for half a second.
+    An object moves from the frame on in which most of its found points are 4 px of 256 from their true first places, and three
+    quarters of those found in the half second from then on.
 
     Args:
         prediction, target: [t k 2] pixels. valid: [t k] bool.
@@ -234,11 +238,16 @@ def _onset(points: AnyArray, start: AnyArray, valid: AnyArray, same: jax.Array, 
     points = jnp.asarray(points, jnp.float32)
     start = jnp.broadcast_to(jnp.asarray(start, jnp.float32), points.shape)
     moved = known & (jnp.sum(jnp.square(jnp.where(known[..., None], points, start) - start), axis=-1) > most**2)
-    shown, votes = (jnp.matmul(flags.astype(jnp.float32), same.astype(jnp.float32)) for flags in (valid, moved))
-    moves = 2 * votes > shown
-    lasts = jnp.pad(moves | (shown == 0), ((0, LASTING - 1), (0, 0)), constant_values=True)
-    begins = moves & functools.reduce(jnp.logical_and, (lasts[i : i + len(moves)] for i in range(1, LASTING)))
-    return jnp.where(jnp.any(begins, axis=0), jnp.argmax(begins, axis=0), len(moves))
+    shown, found, away = (jnp.matmul(flags.astype(jnp.float32), same.astype(jnp.float32)) for flags in (valid, known, moved))
+    lasting_shown, lasting_found, lasting_away = (_sum_ahead(count) for count in (shown, found, away))
+    lasts = (lasting_away >= MOST_MOVED * lasting_found) & (lasting_found >= FEWEST_FOUND * lasting_shown)
+    begins = (2 * away > found) & lasts
+    return jnp.where(jnp.any(begins, axis=0), jnp.argmax(begins, axis=0), len(begins))
+
+
+def _sum_ahead(counts: jax.Array) -> jax.Array:
+    """Sums [t k] of counts [t k] over LASTING frames from each on, fewer at the end."""
+    return lax.reduce_window(counts, np.float32(0), lax.add, (LASTING, 1), (1, 1), ((0, LASTING - 1), (0, 0)))
 
 
 @check_first(check_tracks)
