@@ -97,10 +97,10 @@ def test_an_onset_is_of_each_object_and_needs_a_motion_that_lasts() -> None:
     one_wrong[3:, 0] += 40
     jumps = target.copy()
     jumps[4:9] += 30
-    blank, half_lost = target.copy(), target.copy()
+    blank, third_lost = target.copy(), target.copy()
     blank[::5] = np.nan
-    half_lost[:, ::2] = np.nan
-    for harmless in (one_wrong, jumps, blank, half_lost):
+    third_lost[:, ::3] = np.nan
+    for harmless in (one_wrong, jumps, blank, third_lost):
         assert float(onset_shift(harmless, target, valid, body=body)) == 0
     for never in (np.repeat(target[:1], 40, axis=0), np.full_like(target, np.nan)):
         assert float(onset_shift(never, target, valid, body=body)) == LATEST

@@ -46,7 +46,7 @@ MOVED = 4.0
 """Distance [pixels of TAPVID_SIDE] from its first place from which on a point has moved."""
 LASTING = 8
 """Number of frames, half a second, that a motion lasts to count as begun."""
-MOST_MOVED, FEWEST_FOUND = 0.75, 0.25
+MOST_MOVED, FEWEST_FOUND = 0.75, 0.5
 """Least share of an object's found points that have moved in these frames, and of its visible points that are found: lost
 points neither make nor interrupt a motion."""
 LATEST = 16
