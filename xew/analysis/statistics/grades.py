@@ -104,14 +104,20 @@ class Grades(Protocol):
 
 
 def relative_gain(after: Mean, before: Mean, metric: MetricInfo) -> Mean:
-    """Relative gain of a mean over another: 0.1 is 10 %; positive is better for every metric."""
+    """Relative gain of a mean over another: 0.1 is 10 %; positive is better for every metric.
+
+    Of scores that are never negative, all that there is can be lost (-1), or all of an error gained (1), and no more.
+    """
     sign = 1 if metric.higher_is_better else -1
-    return combine(lambda new, old: sign * (new - old) / np.abs(old), after, before)
+    gain = combine(lambda new, old: sign * (new - old) / np.abs(old), after, before)
+    return gain.within((-1, np.inf) if sign > 0 else (-np.inf, 1)) if metric.range[0] >= 0 else gain
 
 
 def relative_loss(after: Mean, before: Mean, metric: MetricInfo) -> Mean:
     """Relative loss of a mean against another; positive is worse for every metric."""
-    return combine(np.negative, relative_gain(after, before, metric))
+    gain = relative_gain(after, before, metric)
+    low, high = gain.bounds
+    return combine(np.negative, gain).within((-high, -low))
 
 
 def mean_of_folds_that_saw(grades: Grades, robot: str, metric: str) -> Mean | None:
