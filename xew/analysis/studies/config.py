@@ -9,7 +9,7 @@ import shlex
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from xew.config import ConfigError, check_finite, load, merge_settings, read_yaml, suggestion
 from xew.protocol import (
@@ -102,6 +102,8 @@ class Study:
     """Number of training seeds of each task."""
     test_seeds: int = TEST_SEEDS_PER_TASK
     """Number of test seeds of each task."""
+    test_family: Literal["test", "final"] = "test"
+    """Family of the test seeds; final: the block that is reserved for the final study, which nobody has looked at."""
     training_seeds: tuple[int, ...] = ()
     """Seeds of every variant's training runs; one run with the experiment's seed where left out."""
     repeated: tuple[str, ...] = ("*",)
