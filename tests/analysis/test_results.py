@@ -17,8 +17,8 @@ FOLDERS = find_folders()
 
 
 @pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)
-def test_published_tables_charts_and_sentences_are_those_of_the_scores(folder: Path, tmp_path: Path) -> None:
-    """`python -m lab.results` makes them again."""
+def test_published_tables_and_sentences_are_those_of_the_scores(folder: Path, tmp_path: Path) -> None:
+    """And its charts; `python -m lab.results` makes all again."""
     make_report(folder, tmp_path)
     published = sorted((folder / "tables").glob("*.csv"))
     assert published, f"{folder} publishes no table"

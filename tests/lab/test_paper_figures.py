@@ -118,6 +118,9 @@ def test_the_page_has_every_figure_and_what_the_frame_changes(tmp_path: Path, ca
     assert PAPER.correlation("lpips", "kinematic").low < 0 < 0.7 < own["lpips"].low
     assert own["lpips"].r == pytest.approx(PAPER.correlation("lpips", "appearance").r, abs=0.05)
     alone = frame_results(PAPER, frame_distances()["arm_alone"])
+    page = (Path(__file__).parents[2] / "docs" / "distances.md").read_text()
+    for found in (own["lpips"], alone["lpips"]):
+        assert f"| {found.r:.3f} | {found.low:.3f} to {found.high:.3f} |" in page
     assert PAPER.correlation("keypoint_error", "kinematic").r < 0 < alone["keypoint_error"].low
 
 
