@@ -10,9 +10,10 @@ from itertools import product
 
 import numpy as np
 
-from xew.analysis.correlation import FOLDS, dof_correlation, leave_one_out, pearson, permutation_p
+from xew.analysis.correlation import FOLDS, dof_correlation, leave_one_out
 from xew.analysis.distances.matrices import mean_distances
 from xew.analysis.paper import AXES, Paper, PublishedChange
+from xew.statistics import pearson, permutation_p
 
 
 @dataclass(frozen=True)

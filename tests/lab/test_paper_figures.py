@@ -11,9 +11,10 @@ from scipy.optimize import least_squares
 from lab.paper_figures.__main__ import Args, describe, main
 from lab.paper_figures.recompute import rebuild, recompute_changes, recompute_mean_distances
 from lab.paper_figures.tables import frame_distances, frame_results
-from xew.analysis.correlation import leave_one_out, loeo_correlation, pearson
+from xew.analysis.correlation import leave_one_out, loeo_correlation
 from xew.analysis.paper import AXES, read_paper
 from xew.analysis.tables.table import format_signed
+from xew.statistics import pearson
 
 PAPER = read_paper()
 
