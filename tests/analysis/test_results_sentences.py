@@ -30,7 +30,7 @@ from tests.analysis.test_results_pages import (
 from xew.analysis.beyond.difficulty import body_errors, correlate_bodies
 from xew.analysis.paper import read_paper
 from xew.analysis.scores import read_scores
-from xew.analysis.statistics.grades import PaperGrades, relative_gain, unseen_gap
+from xew.analysis.statistics.grades import PaperGrades, paired_means, relative_gain, unseen_gap
 from xew.analysis.statistics.suites import StrictGrades
 from xew.analysis.tables.claims import CLAIMS
 from xew.analysis.tables.comparisons import Reader
@@ -87,9 +87,9 @@ def paper_grades() -> PaperGrades:
 
 
 def paper_gain(part: str, row: str, base: str, robot: str) -> float:
-    after, before = (paper_grades().mean(part, key, robot, "lpips") for key in (row, base))
-    assert after is not None and before is not None
-    return 100 * relative_gain(after, before, paper_grades().metrics["lpips"]).value
+    pair = paired_means(paper_grades(), part, row, base, robot, "lpips")
+    assert pair is not None
+    return 100 * relative_gain(*pair, paper_grades().metrics["lpips"]).value
 
 
 def paper_first_shots() -> Numbers:
