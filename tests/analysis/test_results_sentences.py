@@ -391,6 +391,15 @@ def test_bodies_at_debug_size(label: str) -> None:
     demand(" ".join(row_of("bodies_debug", label)), [found.value for found in means if found])
 
 
+def test_pasting_wins_on_every_body_at_debug_size() -> None:
+    grades, pasted = grades_of("bodies_debug"), errors("bodies_debug")["value"].copy()
+    for body in pasted.index:
+        found = grades.variant_mean(PASTED_RENDER, (body,), "lpips")
+        assert found is not None
+        pasted[body] = found.value
+    assert (errors("bodies_debug")["value"] > pasted).all()
+
+
 def test_the_truth_through_the_codec_on_bodies() -> None:
     groups = ("franka", "piper", "bodies")
     values = [mean("bodies", named("bodies", CODEC_TRUTH), group, "lpips") for group in groups]

@@ -88,9 +88,7 @@ def gain_chart(builder: Builder, gain: GainRows) -> Chart:
     height = 1.0 + 0.42 * len(gain.rows(HELD_OUT_ROBOTS[0]))
     panels = [Panel(builder.ours.metrics[metric].title, partial(draw, metric=metric), height) for metric in metrics]
     legend = [Series(ROBOT_TITLES[robot], ROBOT_COLORS[robot]) for robot in HELD_OUT_ROBOTS]
-    caption = (
-        f"Relative improvement {gain.title}; to the right is better. Lines: 95 % intervals, paired by scene and seed."
-    )
+    caption = f"Relative improvement {gain.title}; to the right is better. Lines: 95 % intervals, paired by scene and seed."
     if builder.paper:
         legend.append(Series("the paper", charts.INK, "o"))
     return Chart(f"gains_{gain.part}", caption, panels, data, legend)
