@@ -116,7 +116,7 @@ def difficulty_table(found: Mapping[str, OverBodies], metrics: Mapping[str, Metr
         metrics,
         "bodies",
         "Error on {} bodies against their distance",
-        "Pearson's r of a body's mean distance to the robots of the training with the model's score on it, with its 95 % "
+        "Pearson's r of a body's mean distance to the training robots with the model's score on it, with its 95 % "
         "interval over bodies. Positive: farther is worse.",
     )
 

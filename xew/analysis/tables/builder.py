@@ -11,14 +11,7 @@ from xew.analysis.scores import TRUTH, MetricInfo
 from xew.analysis.statistics.grades import Grades, PaperGrades, StudyGrades, find_variant, paired_means, pooled
 from xew.analysis.tables.labels import PAPER_METRICS, TRUE
 from xew.analysis.tables.table import TableCell, TableRow, format_interval, format_number
-from xew.protocol import (
-    BASELINES,
-    CODEC_TRUTH,
-    PAPER_PARTS,
-    PARTS,
-    expected_counts,
-    reference,
-)
+from xew.protocol import BASELINES, CODEC_TRUTH, PAPER_PARTS, PARTS, expected_counts, reference
 from xew.statistics import Mean, combine, strict_metrics
 
 
