@@ -492,3 +492,13 @@ def test_drift_of_older_recipes() -> None:
     page = read_page("small_size")
     assert "have {} to {} times the LPIPS".format(*ratios["small_pasted"]) in page
     assert "it is {} to {} times".format(*ratios["small_channels"]) in page
+
+
+def test_numbers_of_training_runs() -> None:
+    """Flow only and the per-frame render have three runs, nine views four, each adaptation two, every other model one."""
+    grades = grades_of("six_tasks")
+    names = {word: reference(embodiment=word).name for word in ("none", "robot_render", "nine_views")}
+    expected = {names["none"]: 3, names["robot_render"]: 3, names["nine_views"]: 4}
+    for variant in grades.variants:
+        assert grades.trainings(variant) == expected.get(variant, 2 if variant.startswith("few_shot") else 1), variant
+    assert "have three runs, nine views four, each adaptation two, every other model one" in read_page("six_tasks")
