@@ -213,6 +213,7 @@ def test_a_subset_keeps_what_it_starts_from(study: Study) -> None:
         (["--tasks", "lift_pott"], "did you mean 'lift_pot'"),
         (["--tasks", "lift_pot", "lift_pot"], "a task is named twice"),
         (["--training-seeds", "1", "1"], "a training seed is named twice in 1, 1"),
+        (["--test-family", "fnal"], "unknown family of test seeds 'fnal'; did you mean 'final'"),
         (["--shots", "1", "5"], "unknown number of shots '5'; known: 1, 2, 3"),
         (["--variants", "loeo_*", "leo_*"], "variants 'leo_\\*' matches none of the parts"),
         (["--variants", "few_shot-piper-3"], "no variant"),
