@@ -9,7 +9,7 @@ import pytest
 from scipy.optimize import least_squares
 
 from lab.paper_figures.__main__ import Args, describe, main
-from lab.paper_figures.recompute import rebuild, recompute_changes, recompute_mean_distances
+from lab.paper_figures.recompute import mean_distances, rebuild, recompute_changes, recompute_mean_distances
 from lab.paper_figures.tables import frame_distances, frame_results
 from xew.analysis.correlation import leave_one_out, loeo_correlation
 from xew.analysis.paper import AXES, read_paper
@@ -77,6 +77,7 @@ def test_a_figure_that_does_not_belong_is_found() -> None:
 
 
 def test_mean_distances_are_those_of_the_matrices() -> None:
+    np.testing.assert_allclose(mean_distances([[0, 1, 2], [1, 0, 3], [2, 3, 0]]), [1.5, 2, 2.5])
     cells = recompute_mean_distances(PAPER)
     assert len(cells) == 10 and all(cell.agrees for cell in cells)
 
