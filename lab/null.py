@@ -1,11 +1,11 @@
 """How often claims are answered where there is nothing to find: studies whose variants are all equal.
 
-    python -m lab.null [--studies 200 --scenes 24]
+    python -m lab.null [--studies 400 --scenes 36]
 
 Every study has the scores of one model under all names. A claim that variants differ is then false whichever way it is
 answered; one that a difference is large is false only where it "holds", one that it is small only where it "fails". The rates
-are to be at most 5 % each, and the command prints them for studies with one run of each variant, several, or any mix of both,
-whose runs differ by 2 and by 5 %.
+are to be at most 5 % each. The command prints the table of docs/report.md: studies with one run of each variant, several, or
+any mix of both, whose runs differ by 2 and by 5 %.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -35,6 +35,9 @@ ANCHORS = tuple(reference(embodiment=name).name for name in ("none", "nine_views
 """Variants of which our study has several runs."""
 SPREADS = (0.02, 0.05)
 """Standard deviations between runs, as shares of a score; our runs differ by 0.5 to 6.5 % in LPIPS."""
+HEAD = """\
+| studies | false "holds" if asked alone, mean (largest of a claim) | false "fails" | any false verdict among all claims |
+|---|---|---|---|"""
 TASKS = 6
 """Number of tasks that scenes are of."""
 HARDNESS, NOISE = 0.15, 0.04
@@ -94,11 +97,11 @@ class Rates:
 class Args:
     """Print how often claims are answered falsely in studies whose variants are all equal."""
 
-    studies: int = 200
+    studies: int = 100
     """Number of studies of each kind."""
-    scenes: int = 24
+    scenes: int = 18
     """Number of scenes of a study, over six tasks."""
-    draws: int = 499
+    draws: int = 299
     """Number of bootstrap draws."""
 
 
@@ -183,7 +186,7 @@ def _empty_table(null: Null, scenes: int) -> pd.DataFrame:
     return cells.merge(scene, how="cross")
 
 
-def measure(null: Null, studies: int = 200, scenes: int = 24, draws: int = 499, seed: int = 0) -> Rates:
+def measure(null: Null, studies: int, scenes: int, draws: int, seed: int = 0) -> Rates:
     """Ask the paper's claims of studies in which there is nothing to find.
 
     Args:
@@ -196,7 +199,7 @@ def measure(null: Null, studies: int = 200, scenes: int = 24, draws: int = 499, 
     claims = [claim for claim in CLAIMS if claim.where != "ours"]
     study, rng = NullStudy(null, scenes, draws), np.random.default_rng(seed)
     held, failed, wrong = dict.fromkeys(names(claims), 0), dict.fromkeys(names(claims), 0), 0
-    asked: set[str] = set()
+    asked: dict[str, None] = {}
     for _ in range(studies):
         study.draw(rng)
         errors = 0
@@ -205,7 +208,7 @@ def measure(null: Null, studies: int = 200, scenes: int = 24, draws: int = 499, 
             held[name] += finding.answer == HOLDS != right
             failed[name] += finding.answer == FAILS != right
             errors += finding.in_family in (HOLDS, FAILS) and finding.in_family != right
-            asked |= {name} if finding.answer != UNMEASURED else set()
+            asked |= {name: None} if finding.answer != UNMEASURED else {}
         wrong += errors > 0
     false_holds = {name: held[name] / studies for name in asked if TRUE_OF_EQUALS.get(name) != HOLDS}
     false_fails = {name: failed[name] / studies for name in asked if TRUE_OF_EQUALS.get(name) != FAILS}
@@ -222,7 +225,7 @@ def nulls() -> Iterator[Null]:
     yield Null("all runs equal")
     yield Null("robots of unequal difficulty", unequal_robots=True)
     for spread, by_seed in product(SPREADS, (0.0, 0.9)):
-        differ = f"runs differ by {spread:.0%}{', mostly by their seed' if by_seed else ''}"
+        differ = f"runs differ by {100 * spread:.0f} %{', mostly by their seed' if by_seed else ''}"
         yield Null(f"{differ}; one of each variant", spread=spread, by_seed=by_seed)
         yield Null(f"{differ}; three of three variants", repeated=3, spread=spread, by_seed=by_seed)
         yield Null(f"{differ}; one, two and three in turn", (1, 2, 3), spread=spread, by_seed=by_seed)
@@ -230,16 +233,18 @@ def nulls() -> Iterator[Null]:
 
 
 def format_rates(rates: Rates) -> str:
-    """A line with the mean rates and the largest of any claim, such as false holds 0.4 % (most 2.0 %: gap)."""
-    parts = []
-    for word, mean, by_claim in (("holds", rates.holds, rates.false_holds), ("fails", rates.fails, rates.false_fails)):
+    """A row of the table: mean rates with the largest of any claim, and the rate of any false answer among all claims."""
+    parts = [rates.null.title]
+    for mean, by_claim in ((rates.holds, rates.false_holds), (rates.fails, rates.false_fails)):
         worst = max(by_claim, key=lambda name: by_claim[name])
-        parts.append(f"false {word} {mean:.1%} of {len(by_claim)} claims (most {by_claim[worst]:.1%}: {worst})")
-    return f"{rates.null.title}: {', '.join(parts)}, any among all claims {rates.family_errors:.1%} of {rates.studies} studies"
+        most = f"{100 * by_claim[worst]:.1f} %{f', {worst}' if by_claim[worst] else ''}"
+        parts.append(f"{100 * mean:.1f} % ({most})")
+    return f"| {' | '.join([*parts, f'{100 * rates.family_errors:.1f} %'])} |"
 
 
 def main(args: Args) -> None:
     """Print the rates of all kinds of studies."""
+    print(HEAD)
     for null in nulls():
         print(format_rates(measure(null, args.studies, args.scenes, args.draws)), flush=True)
 

@@ -4,15 +4,15 @@ Printed figures have few decimals, so a recomputed value may differ from the pri
 `rebuild` and `recompute_changes` say how much that is.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
 
-from xew.analysis.correlation import FOLDS, dof_correlation, leave_one_out, pearson, permutation_p
-from xew.analysis.distances.matrices import mean_distances
+from xew.analysis.correlation import FOLDS, dof_correlation, leave_one_out
 from xew.analysis.paper import AXES, Paper, PublishedChange
+from xew.statistics import pearson, permutation_p
 
 
 @dataclass(frozen=True)
@@ -80,6 +80,12 @@ def recompute_mean_distances(paper: Paper) -> list[RecomputedFigure]:
 def recompute_changes(paper: Paper) -> list[RecomputedChange]:
     """Every percentage of the text, recomputed from the scores that the tables print."""
     return [_recompute_change(paper, change) for change in paper.changes]
+
+
+def mean_distances(matrix: Sequence[Sequence[float]] | np.ndarray) -> np.ndarray:
+    """Each robot's mean distance to the others [... n], from symmetric matrices [... n n] with a zero diagonal."""
+    matrix = np.asarray(matrix, np.float64)
+    return matrix.sum(axis=-1) / (matrix.shape[-1] - 1)
 
 
 def _recompute_change(paper: Paper, change: PublishedChange) -> RecomputedChange:

@@ -5,9 +5,8 @@ from functools import cache
 
 import numpy as np
 
-from lab.paper_figures.recompute import RecomputedChange, RecomputedFigure
+from lab.paper_figures.recompute import RecomputedChange, RecomputedFigure, mean_distances
 from xew.analysis.correlation import Correlation, loeo_correlation
-from xew.analysis.distances.matrices import mean_distances
 from xew.analysis.distances.workspaces import Frame, chamfer_floor, measure
 from xew.analysis.paper import AXES, PAPER_TITLES, Paper, PublishedChange
 from xew.analysis.tables.labels import ACTIONS, LADDER, ROBOT_TITLES, SYSTEMS

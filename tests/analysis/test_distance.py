@@ -19,7 +19,6 @@ from xew.analysis.distance import (
     chamfer_floor,
     chamfer_matrix,
     cosine_distance,
-    mean_distances,
     measure,
     perceptual_matrices,
     workspace,
@@ -213,10 +212,6 @@ def test_matrices_are_of_pairs() -> None:
     assert by_view.shape == (2, 2, 2)
     assert by_view[1, 0, 1] == np.square(robots[0][1].astype(float) - robots[1][1]).sum()
     np.testing.assert_array_equal(by_view, by_view.transpose(0, 2, 1))
-
-
-def test_the_mean_distance_leaves_out_the_robot_itself() -> None:
-    np.testing.assert_allclose(mean_distances([[0, 1, 2], [1, 0, 3], [2, 3, 0]]), [1.5, 2, 2.5])
 
 
 def test_analysis_needs_neither_jax_nor_warp() -> None:

@@ -129,7 +129,7 @@ def test_the_numbers_are_those_of_the_scores(report: Path, study: Study) -> None
         table = pd.read_csv(report / "tables" / f"{robot}.csv")
         cell = table[table["row"].str.startswith("late") & table["column"].str.contains("LPIPS")]
         assert cell["value"].item() == pytest.approx(mean, rel=1e-9) and cell["episodes"].item() == 6
-    assert "6 of 6 test episodes" in text and "Incomplete" not in text
+    assert "6 of 6 episodes" in text and "Incomplete" not in text
 
 
 def test_a_cell_of_the_paper_has_a_mark_only_where_its_verdict_is_another() -> None:
@@ -226,10 +226,10 @@ def test_an_incomplete_table_says_so(study: Study, tmp_path: Path) -> None:
     piper = lambda rows: rows[~((rows["robot"] == "piper") & (rows["seed"] == 1_000_001))]  # noqa: E731
     main(Args(edit(study, tmp_path, piper), study.data, (study.rollouts,), tmp_path / "report"))
     text = (tmp_path / "report" / "index.html").read_text()
-    assert text.count("Incomplete: 4 of 6 test episodes are scored.") == 1
+    assert text.count("Incomplete: 4 of 6 episodes are scored.") == 1
     assert "Piper (4 episodes): late · by one &lt;frame&gt; cannot be compared" in text and "Fewer than 6 scenes" in text
     for name in ("report.md", "tables/piper.tex"):
-        assert "Incomplete: 4 of 6 test episodes are scored." in (tmp_path / "report" / name).read_text()
+        assert "Incomplete: 4 of 6 episodes are scored." in (tmp_path / "report" / name).read_text()
     assert "> Fewer than 6 scenes" in (tmp_path / "report" / "report.md").read_text()
 
 

@@ -3,30 +3,33 @@
 `tables/sentences.txt` holds the lines of report.md that begin with "- ".
 """
 
+import io
 import re
 from pathlib import Path
 
 import pandas as pd
 import pytest
+from PIL import Image
 
-from xew.analysis.report import Args, main
+from lab.results import BY_FRAME, NUMBERS, RESULTS, find_folders, make_report, published_charts, read_sentences
 
-RESULTS = Path(__file__).parents[2] / "docs" / "results"
-OTHER_MOTION = {"own_motion": RESULTS / "six_tasks" / "scores.parquet"}
-"""Score tables of the same study in the other kind of motion, by the folder whose page sets both side by side."""
-FOLDERS = sorted(path.parent for path in RESULTS.glob("*/scores.parquet"))
+FOLDERS = find_folders()
 
 
 @pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)
 def test_published_tables_and_sentences_are_those_of_the_scores(folder: Path, tmp_path: Path) -> None:
-    distances = folder / "distances"
-    other = OTHER_MOTION.get(folder.name)
-    main(Args(folder / "scores.parquet", distances=distances if distances.is_dir() else None, other_motion=other, out=tmp_path))
+    """And its charts; `python -m lab.results` makes all again."""
+    make_report(folder, tmp_path)
     published = sorted((folder / "tables").glob("*.csv"))
     assert published, f"{folder} publishes no table"
     for path in published:
         pd.testing.assert_frame_equal(pd.read_csv(tmp_path / "tables" / path.name), pd.read_csv(path), rtol=1e-6)
-    sentences = [line for line in (tmp_path / "report.md").read_text().splitlines() if line.startswith("- ")]
+    charts = dict(published_charts(folder, tmp_path))
+    assert [path.name for path in folder.glob("*.png") if path not in charts and not path.name.startswith(BY_FRAME)] == []
+    for path, drawn in charts.items():
+        numbers = pd.read_csv(io.StringIO(Image.open(path).text[NUMBERS]))
+        pd.testing.assert_frame_equal(pd.read_csv(drawn.with_suffix(".csv")), numbers, rtol=1e-6)
+    sentences = read_sentences(tmp_path)
     assert sentences and sentences == (folder / "tables" / "sentences.txt").read_text().splitlines()
     if folder.name == "six_tasks":
         check_claims((tmp_path / "report.md").read_text().replace("\u00a0", " "), (folder / "README.md").read_text())

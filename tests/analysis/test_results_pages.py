@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from xew.analysis.scores import read_scores
-from xew.analysis.statistics.grades import StudyGrades, relative_gain, unseen_gap
+from xew.analysis.statistics.grades import StudyGrades, paired_means, relative_gain, unseen_gap
 from xew.protocol import FORGETTING_ROBOT, HELD_OUT_ROBOTS, PASTED_RENDER, ROBOT_NAMES, SEEN_ROBOTS, UNSEEN_BODIES, reference
 from xew.statistics import Mean, combine
 
@@ -158,9 +158,9 @@ def interval(number: Mean, share: float = 100) -> str:
 
 def gain(folder: str, part: str, row: str, base: str, robots: str, metric: str = "lpips") -> Mean:
     grades = grades_of(folder)
-    after, before = (grades.mean(part, key, robots, metric, shared=True) for key in (row, base))
-    assert after is not None and before is not None
-    return relative_gain(after, before, grades.metrics[metric])
+    pair = paired_means(grades, part, row, base, robots, metric)
+    assert pair is not None
+    return relative_gain(*pair, grades.metrics[metric])
 
 
 def loss(*address: str) -> Mean:

@@ -1,12 +1,14 @@
 """Claims asked of studies in which there is nothing to find: at most one in twenty is answered falsely, either way."""
 
 from functools import cache
+from pathlib import Path
 
 import pytest
 
 from lab import null
-from lab.null import ANCHORS, SPREADS, Args, Null, Rates, format_rates, main, measure, nulls
+from lab.null import ANCHORS, HEAD, SPREADS, Args, Null, Rates, format_rates, main, measure, nulls
 
+ROOT = Path(__file__).parents[2]
 KINDS = {kind.title: kind for kind in nulls()}
 STUDIES = 40
 
@@ -20,11 +22,11 @@ def rates(title: str) -> Rates:
     "title",
     [
         "robots of unequal difficulty",
-        "runs differ by 2%; three of three variants",
-        "runs differ by 5%; one of each variant",
-        "runs differ by 5%; three of three variants",
-        "runs differ by 5%; one, two and three in turn",
-        "runs differ by 5%, mostly by their seed; one, two and three in turn",
+        "runs differ by 2 %; three of three variants",
+        "runs differ by 5 %; one of each variant",
+        "runs differ by 5 %; three of three variants",
+        "runs differ by 5 %; one, two and three in turn",
+        "runs differ by 5 %, mostly by their seed; one, two and three in turn",
     ],
 )
 def test_equal_variants_are_rarely_told_apart(title: str) -> None:
@@ -50,7 +52,11 @@ def test_a_claim_that_is_true_of_equals_is_not_counted(monkeypatch: pytest.Monke
     assert measure(Null("little noise"), 5, scenes=18, draws=99).false_fails["flow gains much"] == 1
 
 
-def test_the_command_prints_a_line_for_each_kind(capsys: pytest.CaptureFixture) -> None:
+def test_the_command_prints_the_table_of_the_page(capsys: pytest.CaptureFixture) -> None:
     main(Args(studies=1, scenes=12, draws=49))
-    lines = capsys.readouterr().out.splitlines()
-    assert len(lines) == 18 and all("false holds" in line and "of 1 studies" in line for line in lines)
+    text = capsys.readouterr().out
+    titles = [line.split(" | ")[0].strip("| ") for line in text.removeprefix(HEAD).splitlines()[1:]]
+    page = (ROOT / "docs" / "report.md").read_text()
+    table = page[page.index(HEAD) + len(HEAD) :].split("\n\n")[0]
+    assert titles == list(KINDS) == [line.split(" | ")[0].strip("| ") for line in table.splitlines()[1:]]
+    assert max(float(line.split(" | ")[3].partition(" %")[0]) for line in table.splitlines()[1:]) <= 5

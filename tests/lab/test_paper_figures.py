@@ -9,11 +9,12 @@ import pytest
 from scipy.optimize import least_squares
 
 from lab.paper_figures.__main__ import Args, describe, main
-from lab.paper_figures.recompute import rebuild, recompute_changes, recompute_mean_distances
+from lab.paper_figures.recompute import mean_distances, rebuild, recompute_changes, recompute_mean_distances
 from lab.paper_figures.tables import frame_distances, frame_results
-from xew.analysis.correlation import leave_one_out, loeo_correlation, pearson
+from xew.analysis.correlation import leave_one_out, loeo_correlation
 from xew.analysis.paper import AXES, read_paper
 from xew.analysis.tables.table import format_signed
+from xew.statistics import pearson
 
 PAPER = read_paper()
 
@@ -76,6 +77,7 @@ def test_a_figure_that_does_not_belong_is_found() -> None:
 
 
 def test_mean_distances_are_those_of_the_matrices() -> None:
+    np.testing.assert_allclose(mean_distances([[0, 1, 2], [1, 0, 3], [2, 3, 0]]), [1.5, 2, 2.5])
     cells = recompute_mean_distances(PAPER)
     assert len(cells) == 10 and all(cell.agrees for cell in cells)
 
@@ -118,6 +120,9 @@ def test_the_page_has_every_figure_and_what_the_frame_changes(tmp_path: Path, ca
     assert PAPER.correlation("lpips", "kinematic").low < 0 < 0.7 < own["lpips"].low
     assert own["lpips"].r == pytest.approx(PAPER.correlation("lpips", "appearance").r, abs=0.05)
     alone = frame_results(PAPER, frame_distances()["arm_alone"])
+    page = (Path(__file__).parents[2] / "docs" / "distances.md").read_text()
+    for found in (own["lpips"], alone["lpips"]):
+        assert f"| {found.r:.3f} | {found.low:.3f} to {found.high:.3f} |" in page
     assert PAPER.correlation("keypoint_error", "kinematic").r < 0 < alone["keypoint_error"].low
 
 

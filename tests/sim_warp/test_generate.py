@@ -279,6 +279,20 @@ def test_test_seeds_may_be_of_other_robots() -> None:
     assert [(family.first_seed, family.robots) for family in families] == [(0, ("a", "b")), (TEST_SEED_START, ("b", "c"))]
 
 
+def test_the_reserved_block_has_the_robots_of_the_test_seeds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is made when asked for, from its first seed on."""
+
+    def stop(args: Args, robots: dict[str, tuple[str, ...]], manifest: Manifest) -> list[Family]:
+        planned = {seed_split(family.first_seed): family for family in plan_seeds(args, robots, manifest)}
+        assert planned["final"].first_seed == SEED_STARTS["final"] and planned["final"].wanted == 2
+        assert robots["final"] == robots["test"] == ("piper",) != robots["train"]
+        raise InterruptedError
+
+    monkeypatch.setattr(command, "plan_seeds", stop)
+    with pytest.raises(InterruptedError):
+        generate(Args(tasks=(TASK,), robots=ROBOTS[:1], test_robots=("piper",), final_seeds=2, out=tmp_path))
+
+
 @pytest.mark.parametrize("physics", [None, "cpu"])
 def test_physics_on_the_cpu_leaves_the_gpu_to_the_pictures(
     physics: Literal["cpu"] | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

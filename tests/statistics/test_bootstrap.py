@@ -6,7 +6,8 @@ import pytest
 from scipy import stats
 
 from xew.statistics import DRAWS, MIN_SCENES, fixed_mean
-from xew.statistics.bootstrap import Units, bootstrap_means, draw_units, every_draw, find_strata
+from xew.statistics.bootstrap import Units, bootstrap_means, draw_units, find_strata
+from xew.statistics.correlation import every_draw
 
 
 def one_task(count: int) -> tuple[int, ...]:

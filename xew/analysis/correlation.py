@@ -1,22 +1,14 @@
-"""Correlation of distance with difficulty, over the five leave-one-embodiment-out (LOEO) folds or over many bodies.
+"""Correlation of distance with difficulty over the five leave-one-embodiment-out (LOEO) folds."""
 
-Every r has the same p: the share of pairings of distances with scores whose |r| is as large. All pairings are tried where they
-are few, else DRAWS of them at random.
-"""
-
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
-from itertools import permutations
 
 import numpy as np
 from scipy.stats import rankdata
 
-from xew.statistics import DRAWS, Drawn, every_draw
+from xew.statistics import Drawn, every_draw, pearson, permutation_p
 
 FOLDS = 5
-FEW = 7
-"""Largest number of robots of which all pairings are tried; there are 5,040 of seven."""
 ROBOT_DRAWS = every_draw(FOLDS, least=3)
 """All draws of five robots with replacement [2820 5] but those of one or two robots, where r is undefined or always +-1."""
 
@@ -79,45 +71,11 @@ def dof_correlation(dof: Sequence[float], score: Sequence[float], higher_is_bett
     return float(pearson(x, -y if higher_is_better else y))
 
 
-def pearson(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Pearson's r [...] float64 over the last axis of `x` and `y` [... n]; other axes broadcast.
-
-    NaN where one of the two does not vary.
-    """
-    x, y = (values - values.mean(axis=-1, keepdims=True) for values in (x, y))
-    with np.errstate(invalid="ignore"):
-        return (x * y).sum(axis=-1) / np.sqrt((x**2).sum(axis=-1) * (y**2).sum(axis=-1))
-
-
 def leave_one_out(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Smallest and largest r over the last axis [... 5] when one of the five is left out."""
     rest = np.array([np.delete(np.arange(FOLDS), i) for i in range(FOLDS)])
     r = pearson(x[..., rest], y[..., rest])
     return r.min(axis=-1), r.max(axis=-1)
-
-
-@lru_cache(maxsize=4)
-def list_orders(count: int) -> np.ndarray:
-    """[m n] int, orders of n scores, as they stand first: all if there are at most FEW, else also DRAWS at random."""
-    if count <= FEW:
-        return np.array(list(permutations(range(count))))
-    drawn = np.tile(np.arange(count), (DRAWS, 1))
-    return np.concatenate([np.arange(count)[None], np.random.default_rng(0).permuted(drawn, axis=1)])
-
-
-def permutation_p(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Two-sided p of Pearson's r over the last axis [... n].
-
-    All orders of the scores are equally likely if distance says nothing. Ties up to rounding count as as large.
-    """
-    others = np.abs(pearson(x[..., None, :], y[..., list_orders(y.shape[-1])]))
-    return (others >= np.abs(pearson(x, y))[..., None] - 1e-12).mean(axis=-1)
-
-
-def exact_p(statistic: Callable[[np.ndarray], np.ndarray], scores: np.ndarray) -> float:
-    """The same of any statistic of scores [... 5] float64 that are paired with robots."""
-    others = np.abs(statistic(scores[list_orders(len(scores))]))
-    return float((others >= np.abs(statistic(scores)) - 1e-12).mean())
 
 
 def _bootstrap(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:

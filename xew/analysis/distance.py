@@ -26,7 +26,6 @@ from xew.analysis.distances.appearance import (
     perceptual_matrices,
 )
 from xew.analysis.distances.frames import Axis, distance_frame, matrix_text, robot_frame, robot_text
-from xew.analysis.distances.matrices import mean_distances
 from xew.analysis.distances.workspaces import (
     Features,
     Frame,
@@ -55,7 +54,6 @@ __all__ = [
     "chamfer_floor",
     "chamfer_matrix",
     "cosine_distance",
-    "mean_distances",
     "measure",
     "perceptual_matrices",
     "workspace",

@@ -15,7 +15,7 @@ With --paper it reads nothing: the paper's own figures come with the package, an
 
 import platform
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib import metadata
 from pathlib import Path
@@ -215,10 +215,10 @@ def _make_tables(
     scores: Scores, records: Sequence[Record], held_out: Sequence[str]
 ) -> tuple[list[RobotTable], list[RobotTable]]:
     """A table for each held-out robot, never averaged over them; one for the seen robots pooled, as in the paper."""
-    present = set(scores.rows["robot"])
+    present, families = set(scores.rows["robot"]), {seed_split(seed) for seed in scores.rows["seed"].unique()}
 
     def build(title: str, robots: Sequence[str]) -> RobotTable:
-        return robot_table(scores, title, robots, _count_expected(records, robots) if records else None)
+        return robot_table(scores, title, robots, _count_expected(records, robots, families) if records else None)
 
     apart = [build(robot_title(robot), [robot]) for robot in held_out if robot in present]
     rest = [robot for robot in ROBOT_NAMES if robot in present and robot not in held_out]
@@ -226,11 +226,11 @@ def _make_tables(
     return apart, pooled
 
 
-def _count_expected(records: Sequence[Record], robots: Sequence[str]) -> int:
-    """Test episodes of these robots in seeds that all robots have mastered: what a complete table has."""
+def _count_expected(records: Sequence[Record], robots: Sequence[str], families: Collection[str]) -> int:
+    """Episodes of these robots and families of seeds, in seeds that all robots have mastered: what a complete table has."""
     failed = {(record.task, record.seed) for record in records if not record.success}
-    tests = [record for record in records if seed_split(record.seed) == "test" and (record.task, record.seed) not in failed]
-    return sum(record.robot in robots for record in tests)
+    graded = [record for record in records if record.robot in robots and seed_split(record.seed) in families]
+    return sum((record.task, record.seed) not in failed for record in graded)
 
 
 def _held_out_section(tables: Sequence[RobotTable], metrics: Sequence[MetricInfo]) -> Markup:
@@ -267,7 +267,7 @@ def run_table(table: RobotTable, metrics: Sequence[MetricInfo]) -> Table:
     """One robot's scores as a table: metrics by dimension across, models down."""
     shown = [metric for metric in metrics if any(metric.name in row.scores for row in table.rows)]
     found = " to ".join(map(str, sorted({min(table.counts, default=0), max(table.counts, default=0)})))
-    of = f"{found} episodes" if table.expected is None else f"{found} of {table.expected} test episodes"
+    of = f"{found} episodes" if table.expected is None else f"{found} of {table.expected} episodes"
     named = {metric.name: metric for metric in metrics}
     rows = tuple(_run_row(row, shown, named) for row in table.rows)
     sections = (TableSection("", rows, "" if table.complete else f"Incomplete: {of} are scored."),)

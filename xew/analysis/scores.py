@@ -365,8 +365,7 @@ def _find_wrong_rows(rows: pd.DataFrame, metrics: Sequence[MetricInfo], robots: 
     named = rows.assign(**{VARIANT: name_graded(rows)}) if VARIANT in rows else rows
     key = [*([VARIANT, *EPISODE] if VARIANT in rows else KEY), "metric", *([TRAINING] if TRAINING in rows else [])]
     value = pd.to_numeric(rows["value"], errors="coerce")
-    low = rows["metric"].map({metric.name: -np.inf if metric.low is None else metric.low for metric in metrics})
-    high = rows["metric"].map({metric.name: np.inf if metric.high is None else metric.high for metric in metrics})
+    low, high = (rows["metric"].map({metric.name: metric.range[end] for metric in metrics}) for end in (0, 1))
     # Sums of float32 may pass an end of the range by their rounding.
     out = (value < low - 1e-6) | (value > high + 1e-6)
     found = {

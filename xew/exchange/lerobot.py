@@ -67,7 +67,7 @@ class Args:
     """Robots to export; default: all in the data."""
     tasks: tuple[str, ...] = ()
     """Tasks to export; default: all in the data."""
-    split: Literal["train", "validation", "test"] | None = None
+    split: Literal["train", "validation", "test", "final"] | None = None
     """Family of seeds; default: all. Export the training seeds to train on the set and grade on xew's test seeds."""
     robot_video: bool = False
     """Also export the video of the robot alone, as observation.images.robot."""

@@ -99,7 +99,7 @@ def generate(args: Args) -> list[Family]:
     robots = _find_robots(args.robots, args.out)
     tested = _find_robots(args.test_robots, args.out) or robots
     manifest = Manifest() if args.search else read_manifest(args.manifest)
-    teams = dict.fromkeys(SEED_STARTS, tuple(robots)) | {"test": tuple(tested)}
+    teams = dict.fromkeys(SEED_STARTS, tuple(robots)) | dict.fromkeys(("test", "final"), tuple(tested))
     families = plan_seeds(args, teams, manifest)
     _read_existing(families, args)
     spent: dict[str, float] = defaultdict(float)

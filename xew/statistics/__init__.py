@@ -6,6 +6,7 @@ The package stands on the ground: it imports NumPy, SciPy and pandas, and nothin
     bootstrap.py   draws of scenes within tasks, and the mean of scores in every draw
     runs.py        draws of training runs, and the spread between runs that a single run carries
     means.py       means over scenes and runs, and numbers computed of them
+    correlation.py Pearson's r, its p and its interval
     inference.py   intervals and p-values of what was drawn, Holm's correction for several tests
     verdicts.py    noise floors, and better, worse or unresolved
     suites.py      which of two suites' metrics decides, and where they part
@@ -13,7 +14,8 @@ The package stands on the ground: it imports NumPy, SciPy and pandas, and nothin
     summary.py     means of a table by group of robots, and differences between its models
 """
 
-from xew.statistics.bootstrap import bootstrap_means, every_draw, find_strata
+from xew.statistics.bootstrap import bootstrap_means, find_strata
+from xew.statistics.correlation import every_draw, exact_p, interval_of_r, partial_r, pearson, permutation_p
 from xew.statistics.inference import DRAWS, LEVEL, SIGNIFICANCE, Component, Drawn, holm
 from xew.statistics.means import MIN_SCENES, Mean, Part, combine, fixed_mean, pool_runs
 from xew.statistics.power import describe_power, find_power
@@ -52,6 +54,7 @@ __all__ = [
     "describe_parting",
     "describe_power",
     "every_draw",
+    "exact_p",
     "find_parting",
     "find_power",
     "find_spread",
@@ -59,9 +62,13 @@ __all__ = [
     "fixed_mean",
     "floor_sources",
     "holm",
+    "interval_of_r",
     "largest_floor",
     "measure_power",
     "noise_floor",
+    "partial_r",
+    "pearson",
+    "permutation_p",
     "pool_runs",
     "strict_metrics",
     "summarize",

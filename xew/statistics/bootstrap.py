@@ -11,7 +11,6 @@ no bias however few they are (Rao and Wu 1988, "Resampling inference with comple
 
 from collections.abc import Iterator, Sequence
 from functools import lru_cache
-from itertools import product
 
 import numpy as np
 import pandas as pd
@@ -149,8 +148,3 @@ def draw_units(strata: tuple[int, ...], draws: int = DRAWS) -> tuple[tuple[np.nd
             array.setflags(write=False)
         groups.append((members, scale, weights))
     return tuple(sorted(groups, key=lambda group: group[0][0]))
-
-
-def every_draw(count: int, least: int) -> np.ndarray:
-    """[n count] int, all draws with replacement of `count` units, with at least `least` different units."""
-    return np.array([drawn for drawn in product(range(count), repeat=count) if len(set(drawn)) >= least])

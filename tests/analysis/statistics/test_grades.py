@@ -7,9 +7,9 @@ import pytest
 from tests.analysis.synthetic_study import TASKS, paper_axes, write_study
 from xew.analysis.paper import read_paper
 from xew.analysis.scores import Scores, read_scores
-from xew.analysis.statistics.grades import SEEN, PaperGrades, StudyGrades, find_variant, relative_gain, row_keys
+from xew.analysis.statistics.grades import SEEN, PaperGrades, StudyGrades, find_variant, relative_gain, relative_loss, row_keys
 from xew.protocol import PAPER_PARTS, PARTS, ROBOT_NAMES, SEEN_ROBOTS
-from xew.statistics import ASSUMED_SPREAD, Mean, bootstrap_means, combine
+from xew.statistics import ASSUMED_SPREAD, Mean, bootstrap_means, combine, fixed_mean
 
 
 @pytest.fixture(scope="module")
@@ -71,6 +71,15 @@ def test_differences_are_paired_by_scene(grades: StudyGrades) -> None:
     assert gain.value == pytest.approx((before.value - after.value) / before.value)
     unpaired = before.values[1:] - np.random.default_rng(0).permutation(after.values[1:])
     assert np.ptp(gain.interval()) * before.value < 0.5 * np.ptp(np.quantile(unpaired, [0.025, 0.975]))
+
+
+def test_no_more_than_all_of_a_score_is_lost_and_no_more_than_all_of_an_error_is_gained(grades: StudyGrades) -> None:
+    noisy = fixed_mean(np.r_[0.01, np.random.default_rng(0).normal(0.01, 0.03, 999)], 36, 36)
+    sure = fixed_mean(np.full(1000, 0.02), 36, 36)
+    for metric, place, bound in (("mask_iou", 0, -1), ("lpips", 1, 1)):
+        gain, loss = (number(noisy, sure, grades.metrics[metric]).interval() for number in (relative_gain, relative_loss))
+        assert gain[place] == bound == -loss[1 - place]
+        assert -loss[place] == pytest.approx(gain[1 - place]) and abs(loss[place]) > 1.5
 
 
 def test_the_floor_is_what_the_estimators_miss_on_the_truth(grades: StudyGrades) -> None:

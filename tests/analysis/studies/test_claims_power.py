@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.analysis.synthetic_study import write_study
-from xew.analysis.studies.power import BODIES, Asked, format_power, power_of_r, power_of_two
+from xew.analysis.studies.power import BODIES, RUNS, Asked, format_power, power_of_r, power_of_two
 from xew.analysis.study import main
 from xew.config import ConfigError
 
@@ -40,9 +40,23 @@ def test_correlations_need_bodies() -> None:
     assert power_of_r(0.5, 64, 0.5) < power_of_r(0.5, 64, 0.9)
 
 
+UNRESOLVED_AT_FIRST = ["rays recover", "mask keeps outlines", "flow looks best", "views saturate", "render gains most"]
+UNRESOLVED_AT_FIRST += ["only alignment closes the gap", "the frame flatters", "forgetting", "catastrophic forgetting"]
+UNRESOLVED_AT_FIRST += ["pixel systems lead"]
+"""Claims that scenes and runs can resolve and that the first rules did not."""
+
+
 def test_the_page_has_what_the_command_prints() -> None:
     text = format_power(ROOT / "docs" / "results" / "six_tasks" / "scores.parquet")
     page = (ROOT / "docs" / "study.md").read_text()
+    for scenes, lines in zip((36, 500), text.split(" scenes\n")[1:], strict=True):
+        rows = {line[:36].strip(): line.split()[-5:] for line in lines.splitlines()}
+        for runs in (3, 8):
+            expected = sum(float(rows[name][RUNS.index(runs)]) for name in UNRESOLVED_AT_FIRST)
+            assert f"| {runs} runs, {scenes} scenes | {expected:.1f} |" in page, expected
+    for title, line in (("r = 0.5", "r = 0.5 with one"), ("r = 0.6 against 0.2", "r = 0.6 with one")):
+        (found,) = (each.split()[-3:] for each in text.splitlines() if line in each)
+        assert f"| {title}, over 32, 64 and 128 bodies | {', '.join(found)} |" in page
     expected = [line.split()[-5:] for line in text.splitlines() if "expected of 20 claims" in line]
     assert len(expected) == 2 and all(f"scenes | {' | '.join(numbers)} |" in page for numbers in expected)
     (found,) = (line.split()[-3:] for line in text.splitlines() if "r = 0.5" in line)

@@ -23,6 +23,7 @@ from xew.analysis.studies.cost import (
 from xew.analysis.studies.ledger import Ledger
 from xew.analysis.studies.machines import ThisMachine
 from xew.analysis.studies.plan import Step, plan, sort_steps, source_digest, step_key
+from xew.analysis.study import main
 from xew.analysis.study_analyse import format_coverage
 from xew.config import ConfigError, merge_settings
 from xew.protocol import PAPER_PARTS, PARTS, VARIANTS, expand_robots
@@ -105,6 +106,22 @@ def test_a_study_of_own_motion_makes_and_names_it(study: Study) -> None:
     variants = (VARIANTS["fixed-irasim"], VARIANTS["loeo_piper-optical_flow-nine_views"])
     assert [build_experiment(own, variant)["split"] for variant in variants] == ["fixed_own", "loeo_piper_own"]
     assert build_experiment(study, variants[0])["split"] == "fixed"
+
+
+def test_the_final_study_makes_predicts_and_grades_seeds_that_nobody_has_looked_at(
+    study: Study, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Training seeds stay; steps of other studies keep their digests, since the usual family is in none."""
+    usual, final = plan(study), plan(replace(study, test_family="final"))
+    generate, rollout, baselines = (final[name].command for name in ("generate", "rollout/fixed-mask-none", "baselines"))
+    assert " ".join(generate).endswith("--train-seeds 1 --test-seeds 0 --final-seeds 1")
+    assert rollout[rollout.index("--split") + 1] == baselines[baselines.index("--baselines-of") + 1] == "final"
+    assert "--test-seeds 1" in " ".join(usual["generate"].command) and "final" not in str(usual)
+    assert step_key(final["generate"], []) != step_key(usual["generate"], [])
+    monkeypatch.setattr("xew.analysis.study.check_configs", lambda paths: None)
+    for family, says in (("test", "seeds from 1,000,000"), ("final", "seeds from 2,000,000")):
+        main(["configs/study_debug.yaml", "--dry-run", "--test-family", family, "--out", str(tmp_path / family)])
+        assert says in capsys.readouterr().out
 
 
 def test_coverage_is_told_of_one_variant_and_of_many() -> None:
@@ -196,6 +213,7 @@ def test_a_subset_keeps_what_it_starts_from(study: Study) -> None:
         (["--tasks", "lift_pott"], "did you mean 'lift_pot'"),
         (["--tasks", "lift_pot", "lift_pot"], "a task is named twice"),
         (["--training-seeds", "1", "1"], "a training seed is named twice in 1, 1"),
+        (["--test-family", "fnal"], "unknown family of test seeds 'fnal'; did you mean 'final'"),
         (["--shots", "1", "5"], "unknown number of shots '5'; known: 1, 2, 3"),
         (["--variants", "loeo_*", "leo_*"], "variants 'leo_\\*' matches none of the parts"),
         (["--variants", "few_shot-piper-3"], "no variant"),

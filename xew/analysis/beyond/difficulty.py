@@ -9,9 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
-from scipy.stats import BootstrapMethod, pearsonr
 
-from xew.analysis.correlation import permutation_p
 from xew.analysis.paper import AXES, PAPER_TITLES
 from xew.analysis.scores import COPY, MetricInfo
 from xew.analysis.statistics.grades import StudyGrades
@@ -19,7 +17,7 @@ from xew.analysis.tables.distances import AXIS_TITLES, Distances
 from xew.analysis.tables.labels import PAPER_METRICS
 from xew.analysis.tables.table import Column, Table, TableCell, TableRow, TableSection, format_signed
 from xew.protocol import DISTANCE_BODIES, PARTS, SPLITS
-from xew.statistics import DRAWS, LEVEL, holm
+from xew.statistics import holm, interval_of_r, partial_r, pearson, permutation_p
 
 VARIANT = PARTS["bodies"][0]
 """The model whose errors are correlated."""
@@ -106,15 +104,9 @@ def correlate_bodies(errors: pd.DataFrame, higher_is_better: bool) -> dict[str, 
 
 def _correlate(distance: np.ndarray, score: np.ndarray, frozen: np.ndarray) -> BodyCorrelation:
     """Correlation of n distances with n scores and those of the frozen first frame, each [n] float64."""
-    result = pearsonr(distance, score)
-    resampling = BootstrapMethod(n_resamples=DRAWS, method="BCa", rng=np.random.default_rng(0))
-    interval = result.confidence_interval(LEVEL, method=resampling)
-    r, with_frozen, partial = float(result.statistic), np.nan, np.nan
-    if np.isfinite(frozen).all() and np.ptp(frozen) > 0:
-        with_frozen, between = float(pearsonr(distance, frozen).statistic), float(pearsonr(score, frozen).statistic)
-        partial = (r - with_frozen * between) / np.sqrt((1 - with_frozen**2) * (1 - between**2))
-    low, high = map(float, interval)
-    return BodyCorrelation(r, low, high, float(permutation_p(distance, score)), with_frozen, float(partial), len(score))
+    r, with_frozen, between = (float(pearson(*pair)) for pair in ((distance, score), (distance, frozen), (score, frozen)))
+    p, partial = float(permutation_p(distance, score)), partial_r(r, with_frozen, between)
+    return BodyCorrelation(r, *interval_of_r(distance, score), p, with_frozen, partial, len(score))
 
 
 def difficulty_table(found: Mapping[str, OverBodies], metrics: Mapping[str, MetricInfo]) -> Table | None:
@@ -124,7 +116,7 @@ def difficulty_table(found: Mapping[str, OverBodies], metrics: Mapping[str, Metr
         metrics,
         "bodies",
         "Error on {} bodies against their distance",
-        "Pearson's r of a body's mean distance to the robots of the training with the model's score on it, with its 95 % "
+        "Pearson's r of a body's mean distance to the training robots with the model's score on it, with its 95 % "
         "interval over bodies. Positive: farther is worse.",
     )
 

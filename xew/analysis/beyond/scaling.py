@@ -60,6 +60,6 @@ def scaling_frame(builder: Builder, metric: str) -> pd.DataFrame:
                 rows.append((robots, kind, count, mean.value, *interval_ends(mean, builder.ours.level)))
                 most = max(most, mean.count)
         pasted = builder.variant_cell(PASTED_RENDER, pooled(find_variant(PART, BASE), robots), metric)
-        if pasted.value is not None and pasted.episodes >= most:
+        if pasted.episodes >= most:
             rows.append((robots, PASTED, math.nan, pasted.value, pasted.low, pasted.high))
     return pd.DataFrame(rows, columns=["robots", "trained_on", "bodies", "value", "low", "high"])

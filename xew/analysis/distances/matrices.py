@@ -1,16 +1,10 @@
-"""Symmetric matrices of distances: how they are filled, and the mean distance of each robot to the others."""
+"""Symmetric matrices of distances."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from itertools import combinations
 
 import numpy as np
-
-
-def mean_distances(matrix: Sequence[Sequence[float]] | np.ndarray) -> np.ndarray:
-    """Each robot's mean distance to the others [... n], from symmetric matrices [... n n] with a zero diagonal."""
-    matrix = np.asarray(matrix, np.float64)
-    return matrix.sum(axis=-1) / (matrix.shape[-1] - 1)
 
 
 def symmetric_matrix(count: int, distance: Callable[[int, int], float], workers: int = 1) -> np.ndarray:

@@ -10,12 +10,7 @@ from xew.analysis.reports.study import Content, Report, write_report
 from xew.analysis.reports.study_charts import distance_chart
 from xew.analysis.statistics.grades import PaperGrades
 from xew.analysis.tables.builder import Builder
-from xew.analysis.tables.distances import (
-    certainty_table,
-    correlation_table,
-    distance_tables,
-    printed_distances,
-)
+from xew.analysis.tables.distances import certainty_table, correlation_table, distance_tables, printed_distances
 from xew.analysis.tables.findings import FAILS, HOLDS, UNMEASURED, UNRESOLVED, Finding, ask
 from xew.analysis.tables.layouts import build_tables, count_table
 from xew.analysis.tables.table import TableCell, format_signed

@@ -7,15 +7,7 @@ from pathlib import Path
 import pandas as pd
 from markupsafe import Markup
 
-from xew.analysis.beyond import (
-    Motions,
-    difficulty_table,
-    find_difficulty,
-    find_gaps,
-    gaps_table,
-    motion_table,
-    scaling_table,
-)
+from xew.analysis.beyond import Motions, difficulty_table, find_difficulty, find_gaps, gaps_table, motion_table, scaling_table
 from xew.analysis.paper import AXES, read_paper
 from xew.analysis.reports import page
 from xew.analysis.reports.answer import Answer, answer, answer_strip, study_contests

@@ -68,7 +68,7 @@ def scaling_chart(builder: Builder) -> Chart:
         axes.set_ylim(np.nanmin(ends) - margin, np.nanmax(ends) + margin)
 
     panels = [Panel(title, partial(draw, robots=robots)) for robots, title in GROUPS.items() if robots in set(data["robots"])]
-    caption = "What more bodies in training are worth, at equal numbers of steps. Bands: 95 % intervals over scenes."
+    caption = "What more bodies in training are worth, at equal numbers of steps. Bands: 95 % intervals."
     used = [style for kind, style in (*KINDS.items(), (PASTED, UNLEARNED)) if kind in set(data["trained_on"])]
     return Chart("scaling", caption, panels, data, used)
 
@@ -91,9 +91,9 @@ def motion_chart(motions: Motions) -> Chart:
         charts.bars(axes, list(ACTIONS.values()), groups, metric_title(metric))
         axes.set_xlim(0, 1.05 * longest)
 
-    titles = {robots: "Robots of the training" if robots == SEEN else HELD_OUT_TITLES[robots] for robots in GROUP_TITLES}
+    titles = {robots: "Training robots" if robots == SEEN else HELD_OUT_TITLES[robots] for robots in GROUP_TITLES}
     panels = [Panel(title, partial(draw, robots=robots)) for robots, title in titles.items()]
-    caption = "Shared motion, in which all robots follow one tool path, and own motion. Lines: 95 % intervals over scenes."
+    caption = "Shared motion, in which all robots follow one tool path, and own motion. Lines: 95 % intervals."
     legend = [Series(f"{motion} motion", color) for motion, color in MOTION_COLORS.items()]
     return Chart("motion", caption, panels, data, legend)
 
@@ -103,7 +103,7 @@ def chart_of_bodies(name: str, caption: str, difficulty: OverBodies, trained: st
 
     `trained` says of what the training was, `title` what the number is.
     """
-    errors, heading = difficulty.values, f"mean distance to the {trained} of the training"
+    errors, heading = difficulty.values, f"mean distance to the training {trained}"
 
     def draw(axes: Axes, axis: str) -> None:
         result = difficulty.correlations[axis]

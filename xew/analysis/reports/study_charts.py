@@ -14,7 +14,7 @@ from xew.analysis.paper import AXES
 from xew.analysis.reports import charts
 from xew.analysis.reports.charts import SERIES, SOFT, Chart, Panel, Series
 from xew.analysis.scores import COPY, TRUTH, VARIANT, MetricInfo
-from xew.analysis.statistics.grades import Grades, PaperGrades, find_variant, relative_gain
+from xew.analysis.statistics.grades import Grades, PaperGrades, find_variant, paired_means, relative_gain
 from xew.analysis.tables.builder import Builder, interval_ends
 from xew.analysis.tables.distances import AXIS_TITLES, Distances, unseen_gaps
 from xew.analysis.tables.labels import ACTIONS, LADDER, REMEDIES, ROBOT_TITLES, SHORT_ROBOTS
@@ -88,7 +88,7 @@ def gain_chart(builder: Builder, gain: GainRows) -> Chart:
     height = 1.0 + 0.42 * len(gain.rows(HELD_OUT_ROBOTS[0]))
     panels = [Panel(builder.ours.metrics[metric].title, partial(draw, metric=metric), height) for metric in metrics]
     legend = [Series(ROBOT_TITLES[robot], ROBOT_COLORS[robot]) for robot in HELD_OUT_ROBOTS]
-    caption = f"Relative improvement {gain.title}; to the right is better. Lines: 95 % intervals, paired by scene."
+    caption = f"Relative improvement {gain.title}; to the right is better. Lines: 95 % intervals, paired by scene and seed."
     if builder.paper:
         legend.append(Series("the paper", charts.INK, "o"))
     return Chart(f"gains_{gain.part}", caption, panels, data, legend)
@@ -287,10 +287,10 @@ def _gain(builder: Builder, gain: GainRows, row: str, robot: str, metric: str) -
 
 def _relative_gain(grades: Grades | PaperGrades, part: str, row: str, base: str, robot: str, metric: str) -> np.ndarray:
     """Gain over the base and the ends of its interval [3] float64 [%]; NaN where one of the two is missing."""
-    after, before = (grades.mean(part, key, robot, metric, shared=True) for key in (row, base))
-    if after is None or before is None:
+    pair = paired_means(grades, part, row, base, robot, metric)
+    if pair is None:
         return np.full(3, np.nan)
-    gain = relative_gain(after, before, grades.metrics[metric])
+    gain = relative_gain(*pair, grades.metrics[metric])
     return 100 * np.array([gain.value, *gain.interval(grades.level)])
 
 

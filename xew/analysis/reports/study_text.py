@@ -8,7 +8,7 @@ import pandas as pd
 from xew.analysis.beyond import Motions, OverBodies
 from xew.analysis.paper import AXES
 from xew.analysis.scores import Scores, describe_scores
-from xew.analysis.statistics.grades import BODIES, Grades, StudyGrades, relative_gain
+from xew.analysis.statistics.grades import BODIES, Grades, StudyGrades, paired_means, relative_gain
 from xew.analysis.tables.builder import Builder
 from xew.analysis.tables.comparisons import OTHER_ROBOTS, NotMeasuredError, Reader
 from xew.analysis.tables.distances import Distances, correlate
@@ -246,10 +246,8 @@ def _format_more(share: float) -> str:
 
 
 def _gain(grades: Grades, part: str, row: str, base: str, robot: str) -> float | None:
-    if "lpips" not in grades.metrics:
-        return None
-    after, before = (grades.mean(part, key, robot, "lpips", shared=True) for key in (row, base))
-    return relative_gain(after, before, grades.metrics["lpips"]).value if after and before else None
+    pair = paired_means(grades, part, row, base, robot, "lpips") if "lpips" in grades.metrics else None
+    return relative_gain(*pair, grades.metrics["lpips"]).value if pair else None
 
 
 def part_notes(builder: Builder, scores: Scores) -> Iterator[str]:

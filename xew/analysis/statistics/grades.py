@@ -82,9 +82,6 @@ class Grades(Protocol):
     def mean(self, part: str, row: str, robots: str, metric: str, shared: bool = False) -> Mean | None:
         """The mean at an address, None where nothing is measured; `shared`: over the cells that all rows of the part have."""
 
-    def difference(self, part: str, row: str, base: str, robots: str, metric: str) -> Mean | None:
-        """The mean paired difference of a row from another, over the cells that all rows of the part have."""
-
     def against(self, part: str, row: str, baseline: str, robots: str, metric: str) -> tuple[Mean, Mean] | None:
         """The means of a row and of a baseline, over the cells that all rows of the part and the baseline have.
 
@@ -103,15 +100,27 @@ class Grades(Protocol):
         """
 
 
+def paired_means(grades: Grades, part: str, row: str, base: str, robots: str, metric: str) -> tuple[Mean, Mean] | None:
+    """The means of two rows over the cells that all rows of the part have; None where one of both was not measured."""
+    after, before = (grades.mean(part, key, robots, metric, shared=True) for key in (row, base))
+    return (after, before) if after and before else None
+
+
 def relative_gain(after: Mean, before: Mean, metric: MetricInfo) -> Mean:
-    """Relative gain of a mean over another: 0.1 is 10 %; positive is better for every metric."""
+    """Relative gain of a mean over another: 0.1 is 10 %; positive is better for every metric.
+
+    Of scores that are never negative, all that there is can be lost (-1), or all of an error gained (1), and no more.
+    """
     sign = 1 if metric.higher_is_better else -1
-    return combine(lambda new, old: sign * (new - old) / np.abs(old), after, before)
+    gain = combine(lambda new, old: sign * (new - old) / np.abs(old), after, before)
+    return gain.within((-1, np.inf) if sign > 0 else (-np.inf, 1)) if metric.range[0] >= 0 else gain
 
 
 def relative_loss(after: Mean, before: Mean, metric: MetricInfo) -> Mean:
     """Relative loss of a mean against another; positive is worse for every metric."""
-    return combine(np.negative, relative_gain(after, before, metric))
+    gain = relative_gain(after, before, metric)
+    low, high = gain.bounds
+    return combine(np.negative, gain).within((-high, -low))
 
 
 def mean_of_folds_that_saw(grades: Grades, robot: str, metric: str) -> Mean | None:
@@ -291,10 +300,6 @@ class StudyGrades:
                 self._cache[variant, robots, name, shared_part] = mean
         return self._cache[key]
 
-    def difference(self, part: str, row: str, base: str, robots: str, metric: str) -> Mean | None:
-        after, before = (self.mean(part, key, robots, metric, shared=True) for key in (row, base))
-        return None if after is None or before is None else combine(np.subtract, after, before)
-
     def against(self, part: str, row: str, baseline: str, robots: str, metric: str) -> tuple[Mean, Mean] | None:
         variant = find_variant(part, row)
         if not (self.has(variant.name) and self.has(baseline)):
@@ -414,10 +419,6 @@ class PaperGrades:
             ends = self._rng.choice([-1.0, 1.0], DRAWS) * self._paper.half_digit_of(part, metric)
             self._cache[key] = fixed_mean(np.concatenate([[printed], printed + ends]), 0, None)
         return self._cache[key]
-
-    def difference(self, part: str, row: str, base: str, robots: str, metric: str) -> Mean | None:
-        after, before = (self.mean(part, key, robots, metric) for key in (row, base))
-        return None if after is None or before is None else combine(np.subtract, after, before)
 
     def against(self, part: str, row: str, baseline: str, robots: str, metric: str) -> tuple[Mean, Mean] | None:
         return None  # the paper prints no baseline

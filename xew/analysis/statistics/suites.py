@@ -28,9 +28,6 @@ class StrictGrades:
     def mean(self, part: str, row: str, robots: str, metric: str, shared: bool = False) -> Mean | None:
         return self._grades.mean(part, row, robots, self._strict.get(metric, metric), shared)
 
-    def difference(self, part: str, row: str, base: str, robots: str, metric: str) -> Mean | None:
-        return self._grades.difference(part, row, base, robots, self._strict.get(metric, metric))
-
     def against(self, part: str, row: str, baseline: str, robots: str, metric: str) -> tuple[Mean, Mean] | None:
         return self._grades.against(part, row, baseline, robots, self._strict.get(metric, metric))
 

@@ -102,6 +102,8 @@ class Study:
     """Number of training seeds of each task."""
     test_seeds: int = TEST_SEEDS_PER_TASK
     """Number of test seeds of each task."""
+    test_family: str = "test"
+    """Family of the test seeds; final: the block that is reserved for the final study, which nobody has looked at."""
     training_seeds: tuple[int, ...] = ()
     """Seeds of every variant's training runs; one run with the experiment's seed where left out."""
     repeated: tuple[str, ...] = ("*",)
@@ -260,6 +262,7 @@ def _check_names(study: Study, path: Path) -> None:
         ("robot", expand_robots(study.robots), _KNOWN_ROBOTS),
         ("number of shots", shots, known_shots),
         ("kind of motion", (study.motion,), MOTIONS),
+        ("family of test seeds", (study.test_family,), ("test", "final")),
         ("task", study.tasks, study.tasks),  # known: checked above, and may be outside tasks
         ("training seed", tuple(map(str, study.training_seeds)), tuple(map(str, study.training_seeds))),
         ("kind of step in step_environment", tuple(study.step_environment), KINDS),

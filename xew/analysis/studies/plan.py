@@ -107,7 +107,8 @@ def _rollouts_path(study: Study, variant: str) -> Path:
 
 def _plan_generate(study: Study) -> Step:
     tasks = ("--tasks", *study.tasks) if study.tasks else ()
-    seeds = ("--train-seeds", str(study.train_seeds), "--test-seeds", str(study.test_seeds))
+    counts = {"train": study.train_seeds, "test": 0} | {study.test_family: study.test_seeds}
+    seeds = tuple(text for family, count in counts.items() for text in (f"--{family}-seeds", str(count)))
     motion = () if study.motion == SHARED_MOTION else ("--motion", study.motion)
     robots = dict.fromkeys((study.trained_robots, study.graded_robots))  # once where all are both trained on and graded
     named = tuple(text for option, keys in zip(("--robots", "--test-robots"), robots, strict=False) for text in (option, *keys))
@@ -117,10 +118,15 @@ def _plan_generate(study: Study) -> Step:
         "",
         ("xew.sim_warp.generate", "--out", str(study.data_folder), *asked),
         needs=(),
-        inputs=[SCHEMA_VERSION, study.tasks, *robots, study.train_seeds, study.test_seeds, *motion],
+        inputs=[SCHEMA_VERSION, study.tasks, *robots, study.train_seeds, study.test_seeds, *motion, *_other_family(study)],
         product=study.data_folder,
         every_gpu=True,
     )
+
+
+def _other_family(study: Study) -> tuple[str, ...]:
+    """The family of the test seeds where it is not the usual one; steps of other studies keep their digests."""
+    return () if study.test_family == "test" else (study.test_family,)
 
 
 def _plan_latents(study: Study, variant: Variant, experiment: Settings, first: str) -> Step:
@@ -163,10 +169,11 @@ def _plan_rollout(study: Study, variant: Variant, experiment: Settings) -> Step:
     run, out, robots = run_folder(study, variant), _rollouts_path(study, variant.name), tuple(study.graded_counts(variant))
     settings = {key: value for key, value in experiment.get("rollout", {}).items() if value is not None}
     flags = tuple(text for key, value in settings.items() for text in (f"--rollout.{key.replace('_', '-')}", str(value)))
+    given = ("--data", str(study.data_folder), "--split", study.test_family)
     return Step(
         "rollout",
         variant.name,
-        ("xew.model.rollout", str(run), "--data", str(study.data_folder), "--robots", *robots, "--out", str(out), *flags),
+        ("xew.model.rollout", str(run), *given, "--robots", *robots, "--out", str(out), *flags),
         needs=("generate", _training_name(variant)),
         inputs=[settings, robots],
         product=out,
@@ -180,7 +187,7 @@ def _plan_baselines(study: Study, variant: Variant, experiment: Settings) -> Ste
     """
     out, frames = study.baselines_path, experiment.get("rollout", {}).get("max_frames", 0)
     given = ("--data", str(study.data_folder), "--out", str(out), "--codec", str(_config_path(study, variant)))
-    asked = ("--baselines-of", "test", "--max-frames", str(frames), *study.evaluate)
+    asked = ("--baselines-of", study.test_family, "--max-frames", str(frames), *study.evaluate)
     return Step(
         "baselines",
         "",

@@ -107,7 +107,7 @@ class StudyRunner:
         study, accepted = self.study, [record for _, record in find_accepted(self.study.data_folder)]
         tasks, robots = ({getattr(record, name) for record in accepted} for name in ("task", "robot"))
         beyond = sorted(tasks - set(study.tasks or tasks)) + sorted(robots - set(study.robot_keys))
-        for family, wanted in (("train", study.train_seeds), ("test", study.test_seeds)):
+        for family, wanted in (("train", study.train_seeds), (study.test_family, study.test_seeds)):
             seeds = {(record.task, record.seed) for record in accepted if seed_split(record.seed) == family}
             more = max((len([1 for task, _ in seeds if task == name]) for name in tasks), default=0) - wanted
             beyond += [f"{more} more {family} seeds a task"] if more > 0 else []

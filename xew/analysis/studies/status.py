@@ -9,6 +9,7 @@ from xew.analysis.studies.cost import correct_by_ledger, estimate, format_costs,
 from xew.analysis.studies.ledger import Ledger
 from xew.analysis.studies.plan import Step
 from xew.analysis.studies.processes import last_lines
+from xew.protocol import SEED_STARTS
 
 COLUMNS = ("latents", "train", "rollout", "evaluate")
 """Kinds of steps that the table has a column for; an adaptation stands in the column of training."""
@@ -25,6 +26,7 @@ def format_status(study: Study, steps: Mapping[str, Step], ledger: Ledger, faile
         states = (_format_state(steps[name], ledger, failed or {}) for name in names)
         lines.append(f"{variant.name:<{width}}" + "".join(f"{state:>12}" for state in states))
     lines += [f"{name:<{width}}{_format_state(steps[name], ledger, failed or {}):>12}" for name in steps if "/" not in name]
+    lines += [f"test scenes: seeds from {SEED_STARTS[study.test_family]:,} (family {study.test_family})"]
     return "\n".join(lines)
 
 

@@ -8,18 +8,11 @@ import numpy as np
 
 from xew import statistics
 from xew.analysis.scores import TRUTH, MetricInfo
-from xew.analysis.statistics.grades import Grades, PaperGrades, StudyGrades, find_variant, pooled
+from xew.analysis.statistics.grades import Grades, PaperGrades, StudyGrades, find_variant, paired_means, pooled
 from xew.analysis.tables.labels import PAPER_METRICS, TRUE
 from xew.analysis.tables.table import TableCell, TableRow, format_interval, format_number
-from xew.protocol import (
-    BASELINES,
-    CODEC_TRUTH,
-    PAPER_PARTS,
-    PARTS,
-    expected_counts,
-    reference,
-)
-from xew.statistics import Mean, strict_metrics
+from xew.protocol import BASELINES, CODEC_TRUTH, PAPER_PARTS, PARTS, expected_counts, reference
+from xew.statistics import Mean, combine, strict_metrics
 
 
 @dataclass(frozen=True)
@@ -163,9 +156,10 @@ def _keep_graded(rows: Sequence[TableRow]) -> list[TableRow]:
 
 def paired_verdict(grades: Grades, part: str, row: str, base: str, robots: str, metric: str) -> str:
     """Verdict on the paired difference of a row from another of its part, on the cells that all rows of the part have."""
-    difference = grades.difference(part, row, base, robots, metric)
-    if difference is None:
+    pair = paired_means(grades, part, row, base, robots, metric)
+    if pair is None:
         return ""
+    difference = combine(np.subtract, *pair)
     floor, info = grades.floor(robots, metric, (part, row), (part, base)), grades.metrics[metric]
     return statistics.verdict(difference.value, difference.interval(grades.level), floor, info.higher_is_better)
 

@@ -10,12 +10,12 @@ from itertools import product
 
 import numpy as np
 
-from xew.analysis.correlation import leave_one_out, pearson
+from xew.analysis.correlation import leave_one_out
 from xew.analysis.statistics.grades import REFERENCE
 from xew.analysis.tables.comparisons import Claim, Comparison, NotMeasuredError, Reader
 from xew.analysis.tables.labels import PAPER_METRICS, SHORT_ROBOTS, SYSTEMS, spell_key
 from xew.protocol import FORGETTING_ROBOT, HELD_OUT_ROBOTS, ROBOT_NAMES, SHOTS
-from xew.statistics import combine, fixed_mean
+from xew.statistics import combine, fixed_mean, pearson
 
 FRANKA, PIPER = HELD_OUT_ROBOTS
 PIXELS = ("ray_map", "mask", "optical_flow")

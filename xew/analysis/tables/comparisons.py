@@ -5,12 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from xew.analysis.correlation import exact_p
 from xew.analysis.paper import PAPER_TITLES
 from xew.analysis.statistics.grades import SEEN, Grades, average, mean_of_folds_that_saw, relative_gain, relative_loss
 from xew.analysis.tables.labels import SHORT_ROBOTS
 from xew.protocol import BASELINES, HELD_OUT_ROBOTS, PASTED_RENDER, ROBOT_NAMES, SEEN_ROBOTS
-from xew.statistics import MIN_SCENES, SIGNIFICANCE, Mean, combine, largest_floor
+from xew.statistics import MIN_SCENES, SIGNIFICANCE, Mean, combine, exact_p, largest_floor
 
 OTHER_ROBOTS = "measured on other robots: no model that saw this one was graded"
 """Doubt about a gap measured on other robots, which may be easier or harder to render."""

@@ -1,6 +1,6 @@
 """A `Table` as Markdown, LaTeX (booktabs) and CSV. HTML is in `page`."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import groupby
 
 import pandas as pd
@@ -115,7 +115,7 @@ def _latex_cell(cell: TableCell) -> str:
     return (rf"\textbf{{{text}}}" if cell.best else text) + (f"$^{{{mark}}}$" if mark else "")
 
 
-def _latex_line(cells: Sequence[str]) -> str:
+def _latex_line(cells: Iterable[str]) -> str:
     line = " & ".join(cells) + r" \\"
     return f"{{}}{line}" if line.startswith(("[", "*")) else line  # after a line break these would be its options
 
@@ -180,8 +180,8 @@ def findings_latex(findings: Sequence[Finding], papers: Sequence[Finding] = (), 
     """A LaTeX table of claims: test, both answers, and where given those by the paper's definitions and on its figures."""
     columns = _other_answers({"by paper's": by_paper, "paper": papers}, len(findings))
     rows = [
-        _latex_line([_escape(text) for text in (finding.claim.says, finding.claim.test, *_both_answers(finding), *last)])
-        for finding, last in zip(findings, columns[1:], strict=True)
+        _latex_line(map(_escape, (f.claim.says, f.claim.test, f.in_family, f.answer, f.pasting or "–", *last)))
+        for f, last in zip(findings, columns[1:], strict=True)
     ]
     return "\n".join(
         [
@@ -201,10 +201,6 @@ def findings_latex(findings: Sequence[Finding], papers: Sequence[Finding] = (), 
             "",
         ]
     )
-
-
-def _both_answers(finding: Finding) -> tuple[str, str, str]:
-    return finding.in_family, finding.answer, finding.pasting or "–"
 
 
 def _findings_caption(findings: Sequence[Finding]) -> str:

@@ -24,14 +24,7 @@ from xew.analysis.tables.labels import (
     TRUE,
 )
 from xew.analysis.tables.table import Column, Table, TableCell, TableRow, TableSection, metric_columns, metric_title
-from xew.protocol import (
-    FORGETTING_ROBOT,
-    HELD_OUT_ROBOTS,
-    PARTS,
-    ROBOT_NAMES,
-    SEEN_ROBOTS,
-    SHOTS,
-)
+from xew.protocol import FORGETTING_ROBOT, HELD_OUT_ROBOTS, PARTS, ROBOT_NAMES, SEEN_ROBOTS, SHOTS
 from xew.statistics import strict_metrics
 
 
@@ -67,7 +60,8 @@ def action_table(builder: Builder) -> Table:
     metrics = _keep_measured(builder, ("psnr", "lpips", "mask_iou", "boundary_f1", "pck", "keypoint_error", "trajectory_error"))
     keys = [(key, robot) for key in ACTIONS for robot in HELD_OUT_ROBOTS]
     rows = [builder.row("actions", key, robot, metrics, (ACTIONS[key], SHORT_ROBOTS[robot]), "joints") for key, robot in keys]
-    for first, step in enumerate([len(HELD_OUT_ROBOTS)] * len(HELD_OUT_ROBOTS)):
+    step = len(HELD_OUT_ROBOTS)
+    for first in range(step):
         rows[first::step] = _mark_best(rows[first::step], builder, metrics)
     places = ((key, robot, f"{ACTIONS[key]}, {SHORT_ROBOTS[robot]}") for key, robot in keys)
     floors = (builder.truth((TRUE, SHORT_ROBOTS[r]), [((r,), metric) for metric in metrics]) for r in HELD_OUT_ROBOTS)

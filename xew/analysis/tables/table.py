@@ -6,9 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from xew.analysis.scores import MetricInfo
-from xew.protocol import (
-    DIMENSION_TITLES,
-)
+from xew.protocol import DIMENSION_TITLES
 from xew.statistics import MIN_SCENES
 
 MARKS = (
@@ -128,9 +126,8 @@ def metric_columns(metrics: Mapping[str, MetricInfo], names: Sequence[str]) -> t
 
 
 def format_interval(ends: tuple[float, float], metric: MetricInfo) -> str:
-    """Text such as '0.12–0.15', inside the metric's range; '' where there is no interval, or none at these digits."""
+    """Text such as '0.12–0.15'; '' where there is no interval, or none at these digits."""
     if np.isnan(ends[0]):
         return ""
-    low, high = (-np.inf if metric.low is None else metric.low), (np.inf if metric.high is None else metric.high)
-    first, last = (format_number(float(np.clip(end, low, high)), metric) for end in ends)
+    first, last = (format_number(end, metric) for end in ends)
     return "" if first == last else f"{first}–{last}"
