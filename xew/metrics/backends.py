@@ -45,8 +45,8 @@ class Tracker(Protocol):
     """Positions of the true video's points in a predicted video.
 
     The attribute `pointwise = True` says that each point is found without regard to the others: points of all kinds then come
-    in one call. `compares_colors = True` is as in `Masker`. An optional method `confirm` replaces `presence.confirm_tracks`, with
-    the same arguments.
+    in one call. `compares_colors = True` is as in `Masker`. An optional method `confirm` replaces `presence.confirm_tracks`,
+    with the same arguments.
     """
 
     def __call__(self, prediction: np.ndarray, target: np.ndarray, points: np.ndarray, visible: np.ndarray) -> np.ndarray:
