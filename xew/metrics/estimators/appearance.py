@@ -156,11 +156,13 @@ def _fit_colors(true: np.ndarray, seen: np.ndarray) -> np.ndarray | None:
     if len(true) < FEWEST:
         return None
     x, y = _with_one(true), seen.astype(np.float64)
-    prior = np.eye(4, 3)
+    before = np.sqrt(np.mean((x[:, :3] - y) ** 2))
+    if before <= OTHER_COLORS:
+        return None
     weight = len(x) * PRIOR * np.diag([1.0, 1, 1, 0])
-    color_map = np.linalg.solve(x.T @ x + weight, x.T @ y + weight @ prior)
-    before, after = (np.sqrt(np.mean((x @ some - y) ** 2)) for some in (prior, color_map))
-    return color_map if before > OTHER_COLORS and after < AGREEMENT * before else None
+    color_map = np.linalg.solve(x.T @ x + weight, x.T @ y + weight @ np.eye(4, 3))
+    after = np.sqrt(np.mean((x @ color_map - y) ** 2))
+    return color_map if after < AGREEMENT * before else None
 
 
 def _with_one(colors: np.ndarray) -> np.ndarray:
