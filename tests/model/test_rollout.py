@@ -140,7 +140,7 @@ def test_guidance_of_one_is_none_and_more_goes_away_from_the_negative(predictor:
     text, negative = jnp.array([[5, 6, 0, 0, 0, 0, 0, 0]]), jnp.array([[9, 0, 0, 0, 0, 0, 0, 0]])
     forward = jax.jit(lambda words: model(latents_, conditions, level, words))
     of = {"wanted": forward(text), "unwanted": forward(negative)}
-    inputs = ChunkInputs(jnp.zeros(()), conditions, text, negative, jnp.zeros(()))
+    inputs = ChunkInputs(jnp.zeros(()), conditions, text, negative, jnp.zeros(()), jnp.zeros(()))
     for guidance in (1.0, 3.0):
         expected = of["unwanted"] + guidance * (of["wanted"] - of["unwanted"])
         found = jax.jit(lambda guidance=guidance: guided_velocity(model, inputs, guidance)(latents_, level))()
@@ -164,7 +164,7 @@ def test_one_way_streams_are_computed_once_with_the_same_result(world: Path) -> 
     conditions = {
         name: jax.random.normal(jax.random.key(1), (1, *one_way.inputs.shapes[name])) for name in one_way.inputs.conditions
     }
-    inputs = ChunkInputs(jnp.zeros(()), conditions, jnp.array([[5, 6, 0, 0, 0, 0, 0, 0]]), None, jnp.zeros(()))
+    inputs = ChunkInputs(jnp.zeros(()), conditions, jnp.array([[5, 6, 0, 0, 0, 0, 0, 0]]), None, jnp.zeros(()), jnp.zeros(()))
     latents_, level = jax.random.normal(jax.random.key(0), (1, *shape)), jnp.array([0.7], jnp.float32)
     cached = jax.jit(lambda: guided_velocity(model, inputs, 1.0)(latents_, level))()
     whole = jax.jit(lambda: model(latents_, conditions, level, inputs.text))()

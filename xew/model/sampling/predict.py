@@ -25,7 +25,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from xew.concurrency import map_in_order
 from xew.config import pick
 from xew.dataset import Episode
-from xew.episode import read_pixels
+from xew.episode import Record, read_pixels
 from xew.model.cache.clips import gives_render, needed_pixels, read_streams, take_frames
 from xew.model.cache.scales import Scale, apply_scales
 from xew.model.codecs.contract import Codec, GivenFrames, encode_pictures, given_frames, to_pictures, to_signed
@@ -57,8 +57,10 @@ class ChunkInputs(NamedTuple):
     """[b l e] or [b l]."""
     negative: Array | None
     """The same of the negative prompt, or None without guidance."""
-    keys: Array
-    """[b 2] uint32, data of random keys."""
+    names: Array
+    """[b] uint32, numbers of the episodes, for their noise."""
+    chunk: Array
+    """[] uint32, number of the chunk."""
     given: GivenFrames | None = None
     """Render and first frame for the codec's decoder, or None."""
 
@@ -70,6 +72,7 @@ class ChunkSampling(NamedTuple):
     schedule: NoiseSchedule
     guidance: float
     latent_shape: tuple[int, ...]
+    seed: int
 
 
 class Prediction(NamedTuple):
@@ -121,13 +124,14 @@ class Predictor:
         text, negative = self._encode_text(padded)
         first = self._place(np.stack([stream[FIRST] for stream in streams]))
         unaligned = self._encode_unaligned(streams)
-        sampling = ChunkSampling(self.settings.sampler, self.schedule, self.settings.guidance, self.inputs.latent_shape)
+        settings = self.settings
+        sampling = ChunkSampling(settings.sampler, self.schedule, settings.guidance, self.inputs.latent_shape, settings.seed)
+        names = self._place(np.array([name_number(record) for _, record in padded], np.uint32))
         chunks: list[Array] = []
         for number, start in enumerate(range(0, max(frame_count - 1, 1), self.inputs.clip.frames - 1)):
             conditions = unaligned | self._encode_history(first, chunks, start) | self._encode_conditions(streams, start)
-            keys = self._place(np.stack([self._key(episode, number) for episode in padded]))
-            reference = chunks[-1][:, -1:] if chunks else first
-            inputs = ChunkInputs(reference, conditions, text, negative, keys, self._give_frames(streams, start))
+            reference, given = chunks[-1][:, -1:] if chunks else first, self._give_frames(streams, start)
+            inputs = ChunkInputs(reference, conditions, text, negative, names, np.uint32(number), given)
             with jax.set_mesh(self._mesh) if self._mesh is not None else nullcontext():
                 chunks.append(predict_chunk(self.graph, self.params, self.codec, inputs, sampling))
         return Prediction(chunks, len(episodes), frame_count)
@@ -192,12 +196,6 @@ class Predictor:
         encoded = [encode_pictures(self.codec, past[:, frame : frame + 1]) for frame in earlier]
         return dict.fromkeys(names, jnp.concatenate(encoded, axis=1))
 
-    def _key(self, episode: Episode, chunk: int) -> np.ndarray:
-        _, record = episode
-        name = zlib.crc32(f"{record.task}/{record.seed}/{record.robot}".encode())
-        key = jax.random.fold_in(jax.random.fold_in(jax.random.key(self.settings.seed), name), chunk)
-        return np.asarray(jax.random.key_data(key))
-
     @property
     def _mesh(self) -> Mesh | None:
         sharding = jax.tree.leaves(self.params)[0].sharding
@@ -227,11 +225,21 @@ def predict_chunk(graph: nnx.GraphDef, params: Any, codec: Any, inputs: ChunkInp
     """Predict one chunk of every episode of a batch: uint8 [b t h w 3]."""
     model = nnx.merge(graph, cast_params(graph, params))
     reference = codec.encode_batch(to_signed(inputs.reference))
-    keys = jax.random.wrap_key_data(inputs.keys)
-    noise = jax.vmap(lambda key: jax.random.normal(key, sampling.latent_shape, jnp.float32))(keys)
+    noise = jax.vmap(lambda name: draw_noise(name, inputs.chunk, sampling))(inputs.names)
     velocity, sampler = guided_velocity(model, inputs, sampling.guidance), pick(SAMPLERS, sampling.sampler, "sampler")
     frames = to_pictures(codec.decode_batch(sampler(velocity, reference, noise, sampling.schedule), inputs.given))
     return jax.lax.with_sharding_constraint(frames, PartitionSpec()) if jax.process_count() > 1 else frames
+
+
+def name_number(record: Record) -> int:
+    """Number of an episode by its task, seed and robot."""
+    return zlib.crc32(f"{record.task}/{record.seed}/{record.robot}".encode())
+
+
+def draw_noise(name: Array, chunk: Array, sampling: ChunkSampling) -> Array:
+    """Noise [t h w c] float32 of a chunk of an episode; drawn on the device, because fetching a key waits for all work before it."""
+    key = jax.random.fold_in(jax.random.fold_in(jax.random.key(sampling.seed), name), chunk)
+    return jax.random.normal(key, sampling.latent_shape, jnp.float32)
 
 
 def guided_velocity(model: WorldModel, inputs: ChunkInputs, guidance: float) -> Callable[[Array, Array], Array]:
