@@ -150,14 +150,16 @@ def decode_to_pictures(codec: Any, latents: LatentBatch, given: GivenFrames | No
     return to_pictures(codec.decode_batch(latents, given))
 
 
-def given_frames(render: Pictures, first: UInt8[np.ndarray, "1 h w 3"], start: int, frames: int) -> GivenFrames:
-    """What a rollout is given of `frames` frames of an episode from `start` on: no axis of videos.
+def given_frames(render: Any, first: Any, start: int, frames: int) -> GivenFrames:
+    """What a rollout is given of `frames` frames of episodes from `start` on.
 
     Args:
-        render: [t h w 3] uint8, the commanded robot in the whole episode; its ends are repeated.
-        first: [1 h w 3] uint8, first frame of the episode.
+        render: [... t h w 3] uint8, the commanded robot in the whole episode; its ends are repeated.
+        first: [... 1 h w 3] uint8, first frame of the episode.
     """
-    return GivenFrames(render[np.clip(np.arange(start - 1, start + frames + 1), 0, len(render) - 1)], first)
+    last = render.shape[-4] - 1
+    around = np.clip(np.arange(start - 1, start + frames + 1), 0, last)
+    return GivenFrames(render[..., around, :, :, :], first)
 
 
 def to_signed(pictures: UInt8[Array, "*n"]) -> Float[Array, "*n"]:
