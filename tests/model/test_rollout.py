@@ -109,10 +109,10 @@ def test_later_chunks_continue_the_predicted_and_never_read_the_recorded(
     assert np.abs(np.asarray(chunks[1])[0, 0].astype(int) - expected).mean() < 1
 
 
-def test_a_decoder_that_sees_the_render_sees_no_later_frame_of_the_scene(
-    predictor: Predictor, world: Path, tmp_path: Path
-) -> None:
+@pytest.mark.parametrize("embodiment", ["robot_render", "carried_render"])
+def test_a_decoder_that_sees_the_render_sees_no_later_frame_of_the_scene(embodiment: str, world: Path, tmp_path: Path) -> None:
     """The commands and the first frame give the whole rollout; another render gives another."""
+    predictor = random_predictor(load_experiment(world / "config.yaml", ["--model.embodiment", embodiment]))
     assert isinstance(predictor.codec, ConvAutoencoderCodec)
     seeing = replace(predictor, codec=predictor.codec.with_head(make_head()))
     folder, record = choose_tests(world / "data")[0]

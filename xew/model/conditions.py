@@ -193,7 +193,25 @@ def pasted_render(command: Command) -> Video:
     return paste_render(command.read_first()[0], command.render)
 
 
-SHOW_RENDER = (robot_render, pasted_render)
+def carried_scene(command: Command) -> Video:
+    """The scene without the robot at every frame, where closed grippers carry objects of the first frame: [t h w 3] uint8."""
+    from xew.model.video.carried_scene import View, carry
+
+    assert command.read_first is not None
+    grippers = command.action[:, [gripper for _, gripper in ARMS]]
+    view = View(command.intrinsics, command.extrinsics)
+    return carry(command.read_first()[0], command.render, command.tools, grippers, view)
+
+
+def carried_render(command: Command) -> Video:
+    """The robot alone at every frame, pasted into the scene in which its grippers carry objects: [t h w 3] uint8."""
+    from xew.model.video.carried_scene import paste
+
+    assert command.read_first is not None
+    return paste(command.read_first()[0], carried_scene(command), command.render)
+
+
+SHOW_RENDER = (robot_render, pasted_render, carried_render)
 """Conditions that hold the commanded robot's render."""
 
 
@@ -362,6 +380,11 @@ CONDITIONS: dict[str, Condition | System] = {
         (Condition("pasted_render", "map_channels", pasted_render, is_guess=True),),
         title="Per-frame render in the first frame",
         label="per-frame render pasted into the first frame",
+    ),
+    "carried_render": System(
+        (Condition("carried_render", "map_channels", carried_render, is_guess=True),),
+        title="Per-frame render in a scene with carried objects",
+        label="per-frame render pasted into the first frame, with carried objects",
     ),
 }
 HISTORY = Condition("history", "history", None, title="Earlier frames", label="earlier frames")
