@@ -148,8 +148,7 @@ def draw(image: Image, sprite: Sprite, pose: Pose, view: View) -> None:
     if not depth > 0 or not np.isfinite(target).all():
         return
     before, after = ((corners - corners.mean(axis=0)) @ [1, 1j] for corners in (sprite.source, target))
-    turn = (after * before.conj()).sum()
-    factor = turn / abs(turn) * sprite.depth / depth
+    factor = np.exp(1j * np.angle((after * before.conj()).sum())) * sprite.depth / depth
     matrix = np.array([[factor.real, -factor.imag], [factor.imag, factor.real]])
     offset = target.mean(axis=0) + matrix @ (sprite.corner - sprite.source.mean(axis=0))
     height, width = sprite.mask.shape
