@@ -7,8 +7,9 @@ import pytest
 
 from tests import synthetic
 from xew.episode import read_record, read_states
+from xew.metrics.grading import baselines
 from xew.model.conditions import carried_render, carried_scene, make_command, pasted_render
-from xew.model.video.carried_scene import View, carry, find_grasps
+from xew.model.video.carried_scene import WHITE, View, carry, find_grasps
 from xew.sim_warp.geometry.camera import HEAD_CAMERA, project
 
 VIEW = View(HEAD_CAMERA.intrinsics, HEAD_CAMERA.extrinsics)
@@ -116,5 +117,28 @@ def test_the_condition_is_the_render_in_the_carried_scene(tmp_path: Path) -> Non
     made, pasted = carried_render(command), pasted_render(command)
     assert made.shape == pasted.shape == carried_scene(command).shape and made.dtype == np.uint8
     np.testing.assert_array_equal(made[0], pasted[0])
-    robot = command.render.min(axis=-1) < 200
+    robot = command.render.min(axis=-1) < baselines.WHITE
+    assert WHITE == baselines.WHITE and robot.any()
     np.testing.assert_array_equal(made[1:][robot[1:]], pasted[1:][robot[1:]])
+
+
+def test_an_object_that_a_shadow_joins_to_another_is_taken_alone() -> None:
+    """A dark shadow lies between the object and a mat."""
+    (row, column), first = pixel(START), table(START)
+    first[row + 9 : row + 20, column - 8 : column + 30] = np.multiply(GROUND, 0.76).astype(np.uint8)
+    first[row + 20 : row + 30, column + 20 : column + 70] = (90, 90, 95)
+    made = scenes(first, hands(path(START, GOAL)), CLOSING)
+    assert (made[:, row + 21 : row + 29, column + 21 : column + 69] == (90, 90, 95)).all()
+    assert np.abs(made[-1][pixel(GOAL)].astype(int) - RED).max() < 12
+
+
+def test_what_the_robot_hides_in_the_first_frame_is_not_taken() -> None:
+    """Its place is filled with the ground; what is seen of an object next to it is carried."""
+    (row, column), first = pixel(START), table(START)
+    render = np.full((FRAMES, 240, 320, 3), 255, np.uint8)
+    render[0, row - 20 : row + 20, column : column + 40] = first[row - 20 : row + 20, column : column + 40] = (20, 20, 20)
+    made = carry(first, render, hands(path(START, GOAL)), CLOSING[:, None], VIEW)
+    dark = (made < 150).all(axis=-1)
+    assert not dark.any() and np.abs(made[0][row, column + 5].astype(int) - GROUND).max() <= 2
+    y, x = pixel(GOAL)
+    assert np.abs(made[-1][y, x - 5].astype(int) - RED).max() < 12 and made[-1][y, x + 5].min() > 200

@@ -3,23 +3,20 @@
 Reads  the first frame, the commanded render, tools and grippers, and the camera
 Writes uint8 [t h w 3]: the table where the robot was, and each grasped object, cut out of the first frame, with its hand
 
-The ground is the most frequent color, and its shadows are not darker than `SHADOW` times it. A hand that closes on nothing
-carries nothing.
+A hand that closes on nothing carries nothing. A later grasp can take an object again where it was left.
 """
 
 from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Float, UInt8
 from scipy.spatial.transform import Rotation
 
 from xew.episode import project
+from xew.model.video.ground import Image, Mask, fill, find_object
 
-Image = UInt8[np.ndarray, "h w 3"]
 Video = UInt8[np.ndarray, "t h w 3"]
-Mask = UInt8[np.ndarray, "h w"]
-"""255 inside and 0 outside."""
 Pose = Float[np.ndarray, "7"]
 """Position [m, world] and quaternion x y z w."""
 
@@ -29,12 +26,10 @@ A gripper whose range is below the third never closes."""
 NEAR, REACH, PASS_OVER = 0.02, 0.17, 0.1
 """Distances [m] from the point between the fingers: a held object is nearer than the first, cut off beyond the second, and goes
 over to another closed hand that is nearer than the third when its own hand opens."""
-SHADOW, BRIGHT, TINT = 0.8, 1.06, 0.06
-"""Ratios of a pixel's channels to the ground's: the least and the most of the ground, and their largest difference."""
-LEAST_PIXELS = 25
-"""Number of pixels of the smallest object."""
-CLOSING, RIM, BLUR = 5, 5, 10.0
-"""Side of the kernels [pixels] that close gaps of an object and grow it before it is filled, and the filling's deviation."""
+WHITE = 250
+"""Least level of all channels of the white ground that the robot is rendered on."""
+RIM = 5
+"""Side of the kernel [pixels] that grows an object before its place is filled."""
 SQUARE = 0.05 * np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
 """Corners of a square before the camera [m, camera frame] whose motion with the hand moves the picture of an object."""
 
@@ -114,8 +109,6 @@ def paste(first: Image, scenes: Video, render: Video) -> Video:
 
 def silhouette(render: Image) -> Mask:
     """Where a render on white shows the robot."""
-    from xew.metrics.grading.baselines import WHITE
-
     return cv2.bitwise_not(cv2.inRange(render, (WHITE,) * 3, (255,) * 3))
 
 
@@ -149,52 +142,13 @@ def take(canvas: Image, unseen: Mask, pose: Pose, view: View) -> Sprite | None:
     return sprite
 
 
-def find_object(canvas: Image, unseen: Mask, point: np.ndarray, near: float, reach: float) -> Mask | None:
-    """The connected pixels, unlike the ground, at a point [2] within two radii [pixels]; None if there are too few."""
-    rows, columns = np.ogrid[: canvas.shape[0], : canvas.shape[1]]
-    distance = np.hypot(rows - point[1], columns - point[0])
-    differs = (differ(canvas) & (unseen == 0) & (distance <= reach)).astype(np.uint8)
-    closed = cv2.morphologyEx(differs, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (CLOSING, CLOSING)))
-    count, labels = cv2.connectedComponents(closed)
-    touching = np.bincount(labels[distance <= near], minlength=count)
-    touching[0] = 0
-    if not touching.any():
-        return None
-    mask = (labels == touching.argmax()).astype(np.uint8) * 255
-    outlines, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    cv2.drawContours(mask, outlines, -1, (255,), cv2.FILLED)
-    return mask if cv2.countNonZero(mask) >= LEAST_PIXELS else None
-
-
-def ground_color(image: Image) -> np.ndarray:
-    """The most frequent color [3] of an image, in steps of 8 levels."""
-    coarse = (image >> 3).astype(np.int32) @ np.array([1024, 32, 1])
-    return np.median(image[coarse == np.bincount(coarse.ravel()).argmax()], axis=0)
-
-
-def differ(image: Image) -> Bool[np.ndarray, "h w"]:
-    """Pixels that are neither ground nor its shadow."""
-    ratio = image / np.maximum(ground_color(image), 1).astype(np.float32)
-    least, most = ratio.min(axis=-1), ratio.max(axis=-1)
-    return (least < SHADOW) | (most > BRIGHT) | (most - least > TINT)
-
-
-def fill(image: Image, hole: Mask) -> Image:
-    """The image with a hole filled by the ground around it."""
-    ground = (~differ(image) & (hole == 0)).astype(np.float32)[..., None]
-    known = np.concatenate([image * ground, ground], axis=-1)
-    summed = cv2.GaussianBlur(known, (0, 0), BLUR) + 1e-3 * np.append(ground_color(image), 1)
-    return np.where(hole[..., None] > 0, np.rint(summed[..., :3] / summed[..., 3:]).astype(np.uint8), image)
-
-
 def draw(image: Image, sprite: Sprite, pose: Pose, view: View) -> None:
     """Draw a sprite into an image with its hand at a pose: shifted, turned in the image, and scaled by its depth."""
     target, depth = view.project(sprite.carried(pose))
     if not depth > 0 or not np.isfinite(target).all():
         return
     before, after = ((corners - corners.mean(axis=0)) @ [1, 1j] for corners in (sprite.source, target))
-    turn = (after * before.conj()).sum()
-    factor = turn / abs(turn) * sprite.depth / depth
+    factor = np.exp(1j * np.angle((after * before.conj()).sum())) * sprite.depth / depth
     matrix = np.array([[factor.real, -factor.imag], [factor.imag, factor.real]])
     offset = target.mean(axis=0) + matrix @ (sprite.corner - sprite.source.mean(axis=0))
     height, width = sprite.mask.shape
