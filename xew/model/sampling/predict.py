@@ -29,9 +29,10 @@ from xew.episode import read_pixels
 from xew.model.cache.clips import gives_render, needed_pixels, read_streams, take_frames
 from xew.model.cache.scales import Scale, apply_scales
 from xew.model.codecs.contract import Codec, GivenFrames, encode_pictures, given_frames, to_pictures, to_signed
-from xew.model.conditions import Condition, clip_numbers
+from xew.model.conditions import Condition, clip_numbers, shown_scene
 from xew.model.devices.sharding import batch_sharding, replicated_sharding
 from xew.model.diffusion.samplers import SAMPLERS, NoiseSchedule
+from xew.model.episodes.commands import episode_command
 from xew.model.experiment import Experiment
 from xew.model.network.dit import WorldModel, cast_params, network_graph
 from xew.model.settings.parts import ClipInputs
@@ -41,9 +42,10 @@ from xew.model.video.frames import to_model_size
 from xew.model.video.pixels import stored_pixels
 
 Streams = dict[str, np.ndarray]
-"""Inputs of one whole episode by stream: uint8 [t h w 3] or float32 [t n]; with FIRST and, for some decoders, RENDER."""
+"""Inputs of one whole episode by stream: uint8 [t h w 3] or float32 [t n]; with FIRST and, for some decoders, RENDER, SCENE."""
 FIRST = "first frame"
 RENDER = "render"
+SCENE = "scene"
 
 
 class ChunkInputs(NamedTuple):
@@ -60,7 +62,7 @@ class ChunkInputs(NamedTuple):
     keys: Array
     """[b 2] uint32, data of random keys."""
     given: GivenFrames | None = None
-    """Render and first frame for the codec's decoder, or None."""
+    """Render and scene for the codec's decoder, or None."""
 
 
 class ChunkSampling(NamedTuple):
@@ -137,17 +139,18 @@ class Predictor:
         inputs, (folder, record), clip = self.inputs, episode, self.inputs.clip
         names = [name for name, condition in inputs.conditions.items() if condition.make is not None]
         pixels = stored_pixels(folder, record, needed_pixels(inputs.conditions, names))
+        command = episode_command(folder, record, pixels.get("robot"), pixels.get("rgb"))
         given = {FIRST: read_pixels(folder, "rgb", most=1, record=record)}
         if gives_render(self.codec, inputs.conditions):
-            given[RENDER] = pixels["robot"]
+            given |= {RENDER: pixels["robot"], SCENE: shown_scene(inputs.conditions.values(), command)}
         resized = {name: to_model_size(video, clip.height, clip.width) for name, video in given.items()}
-        return resized | read_streams(inputs.conditions, clip, folder, record, names, pixels)
+        return resized | read_streams(inputs.conditions, clip, folder, record, names, pixels, command)
 
     def _give_frames(self, streams: Sequence[Streams], start: int) -> GivenFrames | None:
         """What the decoder is given of the chunk that begins at frame `start`."""
         if not gives_render(self.codec, self.inputs.conditions):
             return None
-        given = [given_frames(stream[RENDER], stream[FIRST], start, self.inputs.clip.frames) for stream in streams]
+        given = [given_frames(stream[RENDER], stream[SCENE], start, self.inputs.clip.frames) for stream in streams]
         return GivenFrames(*(self._place(np.stack(videos)) for videos in zip(*given, strict=True)))
 
     def _encode_text(self, episodes: Sequence[Episode]) -> tuple[Any, Any]:
