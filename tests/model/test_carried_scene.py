@@ -8,7 +8,7 @@ import pytest
 from tests import synthetic
 from xew.episode import read_record, read_states
 from xew.metrics.grading import baselines
-from xew.model.conditions import carried_render, carried_scene, make_command, pasted_render
+from xew.model.conditions import carried_render, make_command, pasted_render
 from xew.model.video.carried_scene import WHITE, View, carry, find_grasps
 from xew.sim_warp.geometry.camera import HEAD_CAMERA, project
 
@@ -115,7 +115,7 @@ def test_the_condition_is_the_render_in_the_carried_scene(tmp_path: Path) -> Non
     folder = synthetic.write_cell(tmp_path, "place_empty_cup", 0, "piper", frames=5)
     command = make_command(folder, read_record(folder), read_states(folder))
     made, pasted = carried_render(command), pasted_render(command)
-    assert made.shape == pasted.shape == carried_scene(command).shape and made.dtype == np.uint8
+    assert made.shape == pasted.shape == command.carried_scene.shape and made.dtype == np.uint8
     np.testing.assert_array_equal(made[0], pasted[0])
     robot = command.render.min(axis=-1) < baselines.WHITE
     assert WHITE == baselines.WHITE and robot.any()

@@ -29,9 +29,10 @@ from xew.episode import Record, read_pixels
 from xew.model.cache.clips import gives_render, needed_pixels, read_streams, take_frames
 from xew.model.cache.scales import Scale, apply_scales
 from xew.model.codecs.contract import Codec, GivenFrames, encode_pictures, given_frames, to_pictures, to_signed
-from xew.model.conditions import Condition, clip_numbers
+from xew.model.conditions import Condition, clip_numbers, shown_scene
 from xew.model.devices.sharding import batch_sharding, replicated_sharding
 from xew.model.diffusion.samplers import SAMPLERS, NoiseSchedule
+from xew.model.episodes.commands import episode_command
 from xew.model.experiment import Experiment
 from xew.model.network.dit import WorldModel, cast_params, network_graph
 from xew.model.settings.parts import ClipInputs
@@ -41,11 +42,12 @@ from xew.model.video.frames import to_model_size
 from xew.model.video.pixels import stored_pixels
 
 Streams = dict[str, np.ndarray]
-"""Inputs of one whole episode by stream: uint8 [t h w 3] or float32 [t n]; with FIRST and, for some decoders, RENDER."""
+"""Inputs of one whole episode by stream: uint8 [t h w 3] or float32 [t n]; with FIRST and, for some decoders, RENDER, SCENE."""
 EpisodeInputs = tuple[Record, Streams]
 """An episode that was read."""
 FIRST = "first frame"
 RENDER = "render"
+SCENE = "scene"
 
 
 class ChunkInputs(NamedTuple):
@@ -64,7 +66,7 @@ class ChunkInputs(NamedTuple):
     chunk: Array
     """[] uint32, number of the chunk."""
     given: GivenFrames | None = None
-    """Render and first frame for the codec's decoder, or None."""
+    """Render and scene for the codec's decoder, or None."""
 
 
 class ChunkSampling(NamedTuple):
@@ -146,11 +148,12 @@ class Predictor:
         inputs, (folder, record), clip = self.inputs, episode, self.inputs.clip
         names = [name for name, condition in inputs.conditions.items() if condition.make is not None]
         pixels = stored_pixels(folder, record, needed_pixels(inputs.conditions, names))
+        command = episode_command(folder, record, pixels.get("robot"), pixels.get("rgb"))
         given = {FIRST: read_pixels(folder, "rgb", most=1, record=record)}
         if gives_render(self.codec, inputs.conditions):
-            given[RENDER] = pixels["robot"]
+            given |= {RENDER: pixels["robot"], SCENE: shown_scene(inputs.conditions.values(), command)}
         resized = {name: to_model_size(video, clip.height, clip.width) for name, video in given.items()}
-        return record, resized | read_streams(inputs.conditions, clip, folder, record, names, pixels)
+        return record, resized | read_streams(inputs.conditions, clip, folder, record, names, pixels, command)
 
     def _stack(self, episodes: Sequence[Streams], frame_count: int) -> dict[str, Any]:
         """Streams of a batch: numbers [b t n], which the host cuts, and pictures [b t h w 3] on the devices.
@@ -164,9 +167,11 @@ class Predictor:
             arrays = [streams[name] for streams in episodes]
             if arrays[0].ndim == 2:
                 return arrays
-            fixed = name == FIRST or (name != RENDER and not self.inputs.conditions[name].aligned)
+            still = name in (FIRST, SCENE) and all(len(video) == 1 for video in arrays)
+            if still or (name in self.inputs.conditions and not self.inputs.conditions[name].aligned):
+                return self._place(np.stack(arrays))
             follows = frames + (name == RENDER)  # the decoder looks one frame ahead
-            return self._place(np.stack(arrays if fixed else [take_frames(video, 0, follows) for video in arrays]))
+            return self._place(np.stack([take_frames(video, 0, follows) for video in arrays]))
 
         return {name: join(name) for name in episodes[0]}
 
@@ -174,7 +179,7 @@ class Predictor:
         """What the decoder is given of the chunk that begins at frame `start`."""
         if RENDER not in streams:
             return None
-        return given_frames(streams[RENDER], streams[FIRST], start, self.inputs.clip.frames)
+        return given_frames(streams[RENDER], streams[SCENE], start, self.inputs.clip.frames)
 
     def _encode_text(self, records: Sequence[Record]) -> tuple[Any, Any]:
         """Encode the instructions and, with guidance, as many negative prompts."""
