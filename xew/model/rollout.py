@@ -3,7 +3,7 @@
 Reads  a run, or a config that names published weights; episodes
 Writes <out>/<task>/<seed>/<robot>/rgb.mkv (lossless, 320x240) and rollout.json
 
-Episodes are predicted in batches over all devices, in parallel with reading the next batch and writing the previous one.
+Episodes are predicted in batches over all devices, in parallel with reading the next two batches and writing the previous one.
 Command: python -m xew.model.rollout RUN --data DATA --split test [--robots … --out … --rollout.steps …]
 """
 

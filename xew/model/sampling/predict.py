@@ -63,8 +63,8 @@ class ChunkInputs(NamedTuple):
     """The same of the negative prompt, or None without guidance."""
     names: Array
     """[b] uint32, numbers of the episodes, for their noise."""
-    chunk: Array
-    """[] uint32, number of the chunk."""
+    chunk: Array | int
+    """Number of the chunk."""
     given: GivenFrames | None = None
     """Render and scene for the codec's decoder, or None."""
 
@@ -122,18 +122,17 @@ class Predictor:
         """
         size = max(len(episodes), batch)
         size += -size % self._devices
-        padded = [*episodes, *episodes[-1:] * (size - len(episodes))]
+        padded = [*episodes, *[episodes[-1]] * (size - len(episodes))]
         records, streams = [record for record, _ in padded], self._stack([streams for _, streams in padded], frame_count)
         text, negative = self._encode_text(records)
         names = self._place(np.array([name_number(record) for record in records], np.uint32))
         unaligned, sampling = self._encode_unaligned(streams), self._sampling
         chunks: list[Array] = []
         for number, start in enumerate(range(0, max(frame_count - 1, 1), self.inputs.clip.frames - 1)):
-            conditions = (
-                unaligned | self._encode_history(streams[FIRST], chunks, start) | self._encode_conditions(streams, start)
-            )
+            history = self._encode_history(streams[FIRST], chunks, start)
+            conditions = unaligned | history | self._encode_conditions(streams, start)
             reference, given = chunks[-1][:, -1:] if chunks else streams[FIRST], self._give_frames(streams, start)
-            inputs = ChunkInputs(reference, conditions, text, negative, names, np.uint32(number), given)
+            inputs = ChunkInputs(reference, conditions, text, negative, names, number, given)
             with jax.set_mesh(self._mesh) if self._mesh is not None else nullcontext():
                 chunks.append(predict_chunk(self.graph, self.params, self.codec, inputs, sampling))
         return Prediction(chunks, len(episodes), frame_count)
@@ -262,7 +261,7 @@ def name_number(record: Record) -> int:
     return zlib.crc32(f"{record.task}/{record.seed}/{record.robot}".encode())
 
 
-def draw_noise(name: Array, chunk: Array, sampling: ChunkSampling) -> Array:
+def draw_noise(name: Array, chunk: Array | int, sampling: ChunkSampling) -> Array:
     """Noise [t h w c] float32 of a chunk of an episode; traced, because fetching a key would wait for all chunks before it."""
     key = jax.random.fold_in(jax.random.fold_in(jax.random.key(sampling.seed), name), chunk)
     return jax.random.normal(key, sampling.latent_shape, jnp.float32)
