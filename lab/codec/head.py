@@ -1,11 +1,12 @@
 """Train the render head that ships with the codec, from packed groups of frames to a file of weights.
 
 Reads  episodes with pictures, and rollouts of such episodes
-Writes pack: <out>/{truth,render,first,episode,predicted}.npy, memory-mapped; train: weights as .safetensors
+Writes pack: <out>/{truth,render,first,scene,episode,predicted}.npy, memory-mapped; train: weights as .safetensors
 
-A sample is a group of four frames of an episode: the truth, the commanded render around it and the episode's first frame. What
-the head is given was decoded from the truth's latents, half of the time with noise, or was predicted by a model. The robot and
-what moves weigh more. Nothing of the truth but the first frame reaches the head.
+A sample is a group of four frames of an episode: the truth, the commanded render around it, the episode's first frame and, with
+`--carried`, the scene in which grippers carry objects, which is given in the first frame's place. What the
+head is given was decoded from the truth's latents, half of the time with noise, or was predicted by a model. The robot and what
+moves weigh more. Nothing of the truth but the first frame reaches the head.
 Command: python -m lab.codec.head pack --data DATA --robots body:0-11 --out PACK [--rollouts ROLLOUTS]
          python -m lab.codec.head train --packs PACK … --out xew/model/codecs/render_head.safetensors
 """
@@ -38,6 +39,7 @@ from xew.model.codecs.contract import CodecSettings, GivenFrames, given_frames, 
 from xew.model.codecs.conv_autoencoder import save_weights
 from xew.model.codecs.render_head import HeadSize, RenderHead, robot_pixels
 from xew.model.codecs.vae_layers import as_row
+from xew.model.episodes.commands import episode_command
 from xew.model.video.frames import TEMPORAL_FACTOR, padding_to
 from xew.protocol import expand_robots, seed_split
 from xew.rollout import read_rollout, read_rollout_video
@@ -68,6 +70,8 @@ class Pack:
     robots: tuple[str, ...]
     rollouts: Path | None = None
     """Rollouts of the whole episodes; an episode without one is left out."""
+    carried: bool = False
+    """Whether the scene with carried objects is written too."""
     every: int = 3
     """Groups of an episode of which one is taken."""
 
@@ -108,6 +112,8 @@ class Group(NamedTuple):
     """[n 6 h w 3]."""
     first: Any
     """[n 1 h w 3]."""
+    scene: Any
+    """[n 4 h w 3], or None."""
     predicted: Any
     """[n 4 h w 3], or None."""
 
@@ -129,8 +135,8 @@ def pack(args: Pack) -> None:
     counts = [len(list_starts(record.frame_count, record.seed, args.every)) for _, record in episodes]
     total, (height, width, channels) = sum(counts), CAMERA
     shapes = {"truth": (total, 4), "render": (total, 6), "first": (len(episodes), 1)}
-    if args.rollouts is not None:
-        shapes["predicted"] = (total, 4)
+    shapes |= {"scene": (total, 4)} if args.carried else {}
+    shapes |= {"predicted": (total, 4)} if args.rollouts is not None else {}
     args.out.mkdir(parents=True)
     for name, shape in shapes.items():
         np.lib.format.open_memmap(args.out / f"{name}.npy", "w+", np.uint8, (*shape, height, width, channels)).flush()
@@ -152,10 +158,13 @@ def _pack_episode(args: Pack, number: int, episode: Episode, offset: int) -> Non
     arrays = {path.stem: np.load(path, mmap_mode="r+") for path in args.out.glob("*.npy") if path.stem != "episode"}
     truth, render = (read_pixels(folder, name, record=record) for name in ("rgb", "robot"))
     predicted = read_rollout_video(read_rollout(_rollout(args, record))) if args.rollouts is not None else None
+    scene = episode_command(folder, record, render, truth).carried_scene if args.carried else None
     arrays["first"][number] = truth[:1]
     for row, start in enumerate(list_starts(record.frame_count, record.seed, args.every), offset):
         arrays["truth"][row] = truth[start : start + TEMPORAL_FACTOR]
         arrays["render"][row] = given_frames(render, truth[:1], start, TEMPORAL_FACTOR).render
+        if scene is not None:
+            arrays["scene"][row] = scene[start : start + TEMPORAL_FACTOR]
         if predicted is not None:
             arrays["predicted"][row] = predicted[start : start + TEMPORAL_FACTOR]
 
@@ -169,8 +178,8 @@ class Packed:
     def take(self, rows: np.ndarray) -> Group:
         """The groups of some rows."""
         first = self.arrays["first"][self.arrays["episode"][rows]]
-        predicted = self.arrays["predicted"][rows] if "predicted" in self.arrays else None
-        return Group(self.arrays["truth"][rows], self.arrays["render"][rows], first, predicted)
+        scene, predicted = (self.arrays[name][rows] if name in self.arrays else None for name in ("scene", "predicted"))
+        return Group(self.arrays["truth"][rows], self.arrays["render"][rows], first, scene, predicted)
 
 
 def open_pack(folder: Path) -> Packed:
@@ -221,12 +230,12 @@ def decode_noisy(codec: ConvAutoencoderCodec, truth: Array, key: Array, most: fl
 
 
 def head_loss(
-    head: RenderHead, decoded: Array, given: GivenFrames, truth: Array, key: Array, args: Train
+    head: RenderHead, decoded: Array, given: GivenFrames, first: Array, truth: Array, key: Array, args: Train
 ) -> tuple[Array, Array]:
     """The loss, and the mean absolute difference, of groups of frames [b 4 h w 3] in [-1, 1]."""
     frames = head(decoded, given)
     robot = robot_pixels(to_signed(given.render[:, 1:-1]))
-    differs = jnp.abs(truth - to_signed(given.first)).max(axis=-1, keepdims=True) > LEAST_MOTION
+    differs = jnp.abs(truth - to_signed(first)).max(axis=-1, keepdims=True) > LEAST_MOTION
     moves = differs.astype(robot.dtype) * (1 - robot)
     weights = 1 + args.robot_weight * robot + args.motion_weight * moves
     difference = weights * jnp.abs(frames - truth)
@@ -259,12 +268,15 @@ def make_step(args: Train, graph: nnx.GraphDef, optimizer: optax.GradientTransfo
     def step(state: HeadState, group: Group, codec: Any, rate: Array) -> tuple[HeadState, Array]:
         keys = jax.random.split(jax.random.fold_in(jax.random.key(args.seed), state.number), 3)
         varied = vary(keys[0], Group(*(None if part is None else pad(part) for part in group)))
-        truth, given = to_signed(varied.truth), GivenFrames(varied.render, varied.first)
+        truth, given = (
+            to_signed(varied.truth),
+            GivenFrames(varied.render, varied.first if varied.scene is None else varied.scene),
+        )
         is_predicted = varied.predicted is not None
         decoded = to_signed(varied.predicted) if is_predicted else decode_noisy(codec, truth, keys[1], args.noise)
 
         def loss(params: Any) -> tuple[Array, Array]:
-            return head_loss(nnx.merge(graph, params), decoded, given, truth, keys[2], args)
+            return head_loss(nnx.merge(graph, params), decoded, given, varied.first, truth, keys[2], args)
 
         (_, error), gradients = jax.value_and_grad(loss, has_aux=True)(state.params)
         updates, moments = optimizer.update(gradients, state.moments, state.params)

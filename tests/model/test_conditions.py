@@ -36,6 +36,7 @@ from xew.sim_warp.robots import ROBOTS, keep_robot
 
 STORED = [condition for condition in (ACTIONS["joints"], CONDITIONS["robot_render"]) if isinstance(condition, Condition)]
 PASTED = list_conditions(CONDITIONS["pasted_render"])
+CARRIED = list_conditions(CONDITIONS["carried_render"])
 SYSTEMS = {name: entry for name, entry in ACTIONS.items() if isinstance(entry, System) and entry.conditions}
 NUMBERS = [condition for system in SYSTEMS.values() for condition in system if condition.make in (tool_poses, camera)]
 
@@ -69,7 +70,7 @@ def test_robots_of_ones_own_are_those_of_the_data_set_of_the_episode(episode: Pa
     assert command.robot_spec.urdf.is_relative_to((tmp_path / "robots").resolve()) and dict(os.environ) == before
 
 
-@pytest.mark.parametrize("condition", [*STORED, *PASTED, *NUMBERS], ids=lambda condition: condition.name)
+@pytest.mark.parametrize("condition", [*STORED, *PASTED, *CARRIED, *NUMBERS], ids=lambda condition: condition.name)
 def test_no_condition_sees_the_recorded_future(episode: Path, condition: object) -> None:
     """Turn everything that was recorded from frame 1 on upside down: the condition stays as it was."""
     record, states = read_record(episode), read_states(episode)

@@ -160,8 +160,9 @@ def test_only_what_is_needed_is_read(simulated: Path) -> None:
     assert needed_pixels(experiment.conditions, ["action"]) == []
     joints = load_experiment(simulated / "config.yaml", ["--model.action", "joints", "--model.embodiment", "none"])
     assert needed_pixels(joints.conditions, ["rgb", "joints"]) == ["rgb"]
-    pasted = load_experiment(simulated / "config.yaml", ["--model.action", "none", "--model.embodiment", "pasted_render"])
-    assert needed_pixels(pasted.conditions, ["map_channels"]) == ["robot"], "one frame of the scene is no whole video"
+    for embodiment in ("pasted_render", "carried_render"):
+        pasted = load_experiment(simulated / "config.yaml", ["--model.action", "none", "--model.embodiment", embodiment])
+        assert needed_pixels(pasted.conditions, ["map_channels"]) == ["robot"], "one frame of the scene is no whole video"
 
 
 def test_a_render_at_hand_is_not_read_again() -> None:

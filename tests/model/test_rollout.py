@@ -102,17 +102,17 @@ def test_later_chunks_continue_the_predicted_and_never_read_the_recorded(
     write_video(tmp_path / "rgb.mkv", video)
     changed = replace(record, hashes=record.hashes | {"rgb": array_hash(video)})
     np.testing.assert_array_equal(predictor.predict([(tmp_path, changed)], FRAMES), before)
-    chunks = predictor.begin([episode], FRAMES).chunks
+    chunks = predictor.begin([predictor.read(episode)], FRAMES).chunks
     assert len(chunks) == 3
     reference = encode_pictures(predictor.codec, np.asarray(chunks[0])[:, -1:])
     expected = predictor.codec.decode(np.asarray(reference)[0])[0]
     assert np.abs(np.asarray(chunks[1])[0, 0].astype(int) - expected).mean() < 1
 
 
-def test_a_decoder_that_sees_the_render_sees_no_later_frame_of_the_scene(
-    predictor: Predictor, world: Path, tmp_path: Path
-) -> None:
+@pytest.mark.parametrize("embodiment", ["robot_render", "carried_render"])
+def test_a_decoder_that_sees_the_render_sees_no_later_frame_of_the_scene(embodiment: str, world: Path, tmp_path: Path) -> None:
     """The commands and the first frame give the whole rollout; another render gives another."""
+    predictor = random_predictor(load_experiment(world / "config.yaml", ["--model.embodiment", embodiment]))
     assert isinstance(predictor.codec, ConvAutoencoderCodec)
     seeing = replace(predictor, codec=predictor.codec.with_head(make_head()))
     folder, record = choose_tests(world / "data")[0]
@@ -140,7 +140,7 @@ def test_guidance_of_one_is_none_and_more_goes_away_from_the_negative(predictor:
     text, negative = jnp.array([[5, 6, 0, 0, 0, 0, 0, 0]]), jnp.array([[9, 0, 0, 0, 0, 0, 0, 0]])
     forward = jax.jit(lambda words: model(latents_, conditions, level, words))
     of = {"wanted": forward(text), "unwanted": forward(negative)}
-    inputs = ChunkInputs(jnp.zeros(()), conditions, text, negative, jnp.zeros(()))
+    inputs = ChunkInputs(jnp.zeros(()), conditions, text, negative, jnp.zeros(()), jnp.zeros(()))
     for guidance in (1.0, 3.0):
         expected = of["unwanted"] + guidance * (of["wanted"] - of["unwanted"])
         found = jax.jit(lambda guidance=guidance: guided_velocity(model, inputs, guidance)(latents_, level))()
@@ -164,7 +164,7 @@ def test_one_way_streams_are_computed_once_with_the_same_result(world: Path) -> 
     conditions = {
         name: jax.random.normal(jax.random.key(1), (1, *one_way.inputs.shapes[name])) for name in one_way.inputs.conditions
     }
-    inputs = ChunkInputs(jnp.zeros(()), conditions, jnp.array([[5, 6, 0, 0, 0, 0, 0, 0]]), None, jnp.zeros(()))
+    inputs = ChunkInputs(jnp.zeros(()), conditions, jnp.array([[5, 6, 0, 0, 0, 0, 0, 0]]), None, jnp.zeros(()), jnp.zeros(()))
     latents_, level = jax.random.normal(jax.random.key(0), (1, *shape)), jnp.array([0.7], jnp.float32)
     cached = jax.jit(lambda: guided_velocity(model, inputs, 1.0)(latents_, level))()
     whole = jax.jit(lambda: model(latents_, conditions, level, inputs.text))()
@@ -207,7 +207,7 @@ predictor = random_predictor(experiment)
 mesh = make_mesh(MeshSettings())
 predictor = replace(predictor, params=jax.device_put(predictor.params, replicated_sharding(mesh)))
 episodes = choose_tests(experiment.data)[:3]
-begun = predictor.begin(episodes, FRAMES)
+begun = predictor.begin([predictor.read(episode) for episode in episodes], FRAMES)
 assert len(begun.chunks[0].sharding.device_set) == 2 and begun.chunks[0].shape[0] == 4
 np.save({out!r}, begun.fetch())
 """

@@ -10,7 +10,7 @@ other systems of the paper, as combinations of mechanisms (network/mechanisms.py
 measurement and no frame of the scene after the first, so no condition can show the future.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
@@ -72,6 +72,15 @@ class Command:
         from xew.sim_warp.kinematics.forward import tool_poses
 
         return tool_poses(self.robot_spec, self.action)
+
+    @cached_property
+    def carried_scene(self) -> Video:
+        """The scene without the robot, where closed grippers carry objects of the first frame: [t h w 3] uint8."""
+        from xew.model.video.carried_scene import View, carry
+
+        assert self.read_first is not None
+        grippers = self.action[:, [gripper for _, gripper in ARMS]]
+        return carry(self.read_first()[0], self.render, self.tools, grippers, View(self.intrinsics, self.extrinsics))
 
     @cached_property
     def robot_spec(self) -> "xew.sim_warp.embodiment.spec.RobotSpec":
@@ -193,8 +202,27 @@ def pasted_render(command: Command) -> Video:
     return paste_render(command.read_first()[0], command.render)
 
 
-SHOW_RENDER = (robot_render, pasted_render)
+def carried_render(command: Command) -> Video:
+    """The robot alone at every frame, pasted into the scene in which its grippers carry objects: [t h w 3] uint8."""
+    from xew.model.video.carried_scene import paste
+
+    assert command.read_first is not None
+    return paste(command.read_first()[0], command.carried_scene, command.render)
+
+
+SHOW_RENDER = (robot_render, pasted_render, carried_render)
 """Conditions that hold the commanded robot's render."""
+
+
+def shown_scene(conditions: Iterable[Condition], command: Command) -> Video:
+    """The scene of a decoder: [t h w 3] uint8 with carried objects if a condition holds it, else its first frame."""
+    assert command.read_first is not None
+    return command.carried_scene if shows_carried(conditions) else command.read_first()
+
+
+def shows_carried(conditions: Iterable[Condition]) -> bool:
+    """Whether a condition holds the scene with carried objects."""
+    return any(condition.make is carried_render for condition in conditions)
 
 
 def robot_mask(command: Command) -> Video:
@@ -362,6 +390,11 @@ CONDITIONS: dict[str, Condition | System] = {
         (Condition("pasted_render", "map_channels", pasted_render, is_guess=True),),
         title="Per-frame render in the first frame",
         label="per-frame render pasted into the first frame",
+    ),
+    "carried_render": System(
+        (Condition("carried_render", "map_channels", carried_render, is_guess=True),),
+        title="Per-frame render in a scene with carried objects",
+        label="per-frame render pasted into the first frame, with carried objects",
     ),
 }
 HISTORY = Condition("history", "history", None, title="Earlier frames", label="earlier frames")

@@ -15,6 +15,7 @@ from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any
 
+import numpy as np
 from tqdm import tqdm
 
 from xew.compilation import keep_compiled_programs, take_memory_as_needed
@@ -27,7 +28,10 @@ from xew.model.cache.keys import CACHE_VERSION
 from xew.model.cache.scales import keep_scales
 from xew.model.cache.store import LatentCache, load_codec
 from xew.model.codecs.ceiling import check_lpips, choose_evenly, measure_ceiling
+from xew.model.codecs.contract import Codec
+from xew.model.conditions import shown_scene
 from xew.model.episodes.choice import replay_episodes, training_episodes
+from xew.model.episodes.commands import episode_command
 from xew.model.experiment import Experiment, parse_experiment
 from xew.model.settings.settings import Clip
 from xew.model.video.pixels import PixelSource, rendered_pixels, stored_pixels
@@ -115,12 +119,21 @@ def report_ceiling(
     stored = _read_ceiling(cache, experiment.clip, hashes)
     if stored is not None:
         return stored
-    names = ("rgb", "robot") if gives_render(cache.codec, experiment.conditions) else ("rgb",)
-    pixels = (source(folder, record, names) for folder, record in chosen)
-    videos = ((videos["rgb"], videos["robot"] if "robot" in names else None) for videos in pixels)
+    videos = (_ceiling_videos(experiment, cache.codec, episode, source) for episode in chosen)
     measured = measure_ceiling(cache.codec, videos, **asdict(experiment.clip))
     tqdm.write(f"codec ceiling: {measured}, of {on}")
     return {**asdict(measured), "of": on, "robots": sorted({record.robot for _, record in chosen}), "videos": hashes}
+
+
+def _ceiling_videos(
+    experiment: Experiment, codec: Codec, episode: Episode, source: PixelSource
+) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None]:
+    """The truth of an episode, and the render and the scene if the model's decoder is given them, uint8 [t 240 320 3]."""
+    if not gives_render(codec, experiment.conditions):
+        return source(*episode, ("rgb",))["rgb"], None, None
+    pixels = source(*episode, ("rgb", "robot"))
+    command = episode_command(*episode, pixels["robot"], pixels["rgb"])
+    return pixels["rgb"], pixels["robot"], shown_scene(experiment.conditions.values(), command)
 
 
 def _read_ceiling(cache: LatentCache, clip: Clip, videos: Sequence[str]) -> dict[str, Any] | None:

@@ -3,7 +3,7 @@
 Reads  a run, or a config that names published weights; episodes
 Writes <out>/<task>/<seed>/<robot>/rgb.mkv (lossless, 320x240) and rollout.json
 
-Episodes are predicted in batches over all devices, in parallel with reading the next batch and writing the previous one.
+Episodes are predicted in batches over all devices, in parallel with reading the next two batches and writing the previous one.
 Command: python -m xew.model.rollout RUN --data DATA --split test [--robots … --out … --rollout.steps …]
 """
 
@@ -24,7 +24,7 @@ from tqdm import tqdm
 
 from xew.command_line import find_path, parse_command
 from xew.compilation import keep_compiled_programs
-from xew.concurrency import usable_cores
+from xew.concurrency import map_in_order, usable_cores
 from xew.config import CONVERTER, ConfigError, admit, find_config, is_packaged, user_errors
 from xew.dataset import Episode
 from xew.episode import Record, episode_folder, remove_left_overs
@@ -188,9 +188,10 @@ class RolloutWriter:
 
 
 def predict_and_write(predictor: Predictor, pending: Sequence[Item], writer: RolloutWriter) -> None:
-    """Roll out episodes in batches of similar length, and write them; reads one batch ahead of the devices."""
+    """Roll out episodes in batches of similar length, and write them; threads read two batches ahead of the devices."""
     size = max(min(predictor.settings.batch, len(pending)), 1)
     ordered = sorted(pending, key=lambda item: item[1]["frame_count"])
+    read = map_in_order(predictor.read, [episode for episode, _ in ordered], min(size, usable_cores()))
     started: deque[tuple[list[Item], Prediction]] = deque()
 
     def write_oldest() -> None:
@@ -200,7 +201,8 @@ def predict_and_write(predictor: Predictor, pending: Sequence[Item], writer: Rol
 
     for start in range(0, len(ordered), size):
         items = ordered[start : start + size]
-        started.append((items, predictor.begin([episode for episode, _ in items], items[-1][1]["frame_count"], size)))
+        inputs = list(itertools.islice(read, len(items)))
+        started.append((items, predictor.begin(inputs, items[-1][1]["frame_count"], size)))
         if len(started) > 1:
             write_oldest()
     while started:

@@ -8,8 +8,9 @@ import pytest
 from lab.codec import head
 from lab.codec.head import Packed, Train, draw_batches, list_starts, open_pack
 from tests import synthetic
-from xew.episode import episode_folder, read_video
+from xew.episode import episode_folder, read_record, read_video
 from xew.model.codecs.render_head import HeadSize, load_head
+from xew.model.episodes.commands import episode_command
 from xew.rollout import write_rollout
 
 
@@ -26,17 +27,19 @@ def test_groups_lie_behind_the_first_frame_and_seeds_take_different_ones(seed: i
 
 
 def test_a_pack_holds_the_groups_of_training_seeds_of_the_named_robots(data: Path, tmp_path: Path) -> None:
-    head.main(["pack", "--data", str(data), "--out", str(tmp_path / "pack"), "--robots", "ur5_wsg", "--every", "2"])
+    words = ["--robots", "ur5_wsg", "--every", "2", "--carried"]
+    head.main(["pack", "--data", str(data), "--out", str(tmp_path / "pack"), *words])
     arrays = open_pack(tmp_path / "pack").arrays
     folder = episode_folder(data, "place_empty_cup", 1, "ur5_wsg")
     truth, render = read_video(folder / "rgb.mkv"), read_video(folder / "robot.mkv")
-    starts = list_starts(len(truth), 1, 2)
+    starts, scene = list_starts(len(truth), 1, 2), episode_command(folder, read_record(folder)).carried_scene
     assert arrays["episode"].max() == 1, "the test seed is not among them"
     rows = np.flatnonzero(arrays["episode"] == 1)
     assert len(rows) == len(starts)
     for row, start in zip(rows, starts, strict=True):
         np.testing.assert_array_equal(arrays["truth"][row], truth[start : start + 4])
         np.testing.assert_array_equal(arrays["render"][row, 1:5], render[start : start + 4])
+        np.testing.assert_array_equal(arrays["scene"][row], scene[start : start + 4])
     np.testing.assert_array_equal(arrays["first"][1], truth[:1])
 
 
@@ -61,8 +64,10 @@ def test_batches_are_drawn_from_both_kinds_of_packs(share: float, expected: set[
     assert all(rows.max() < len(packed.arrays["truth"]) for packed, rows in drawn)
 
 
-def test_a_head_is_trained_and_written(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    head.main(["pack", "--data", str(data), "--out", str(tmp_path / "pack"), "--robots", "ur5_wsg", "--every", "1"])
+@pytest.mark.parametrize("carried", [[], ["--carried"]])
+def test_a_head_is_trained_and_written(data: Path, tmp_path: Path, carried: list[str]) -> None:
+    words = ["--robots", "ur5_wsg", "--every", "1", *carried]
+    head.main(["pack", "--data", str(data), "--out", str(tmp_path / "pack"), *words])
     words = ["--packs", str(tmp_path / "pack"), "--out", str(tmp_path / "head.safetensors"), "--batch", "1", "--lpips", "0"]
     head.main(["train", *words, "--seconds", "2", "--size.widths", "8", "8", "--size.blocks", "1", "1"])
     trained = load_head(tmp_path / "head.safetensors")

@@ -83,9 +83,9 @@ class Halved:
     """A codec for tests, which leaves every second pixel; the folder of its run has the name of the model."""
 
     def __init__(self, run: Path) -> None:
-        self.model, self.digest, self.sees_render = run.name, "halved", False
+        self.model, self.digest = run.name, "halved"
 
-    def __call__(self, video: np.ndarray, render: np.ndarray | None = None) -> np.ndarray:
+    def __call__(self, video: np.ndarray, episode: Path | None = None) -> np.ndarray:
         return video[:, ::2, ::2].repeat(2, axis=1).repeat(2, axis=2)
 
 

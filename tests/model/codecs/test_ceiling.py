@@ -22,7 +22,7 @@ def picture(seed: int) -> np.ndarray:
 def test_ceiling() -> None:
     videos = [np.repeat(picture(seed), frames, 0) for seed, frames in ((0, 3), (1, 9))]
     codec = ConvAutoencoderCodec.open(CodecSettings(weights=TINY_CODEC))
-    ceiling = measure_ceiling(codec, ((video, None) for video in videos), 5, 48, 64)
+    ceiling = measure_ceiling(codec, ((video, None, None) for video in videos), 5, 48, 64)
     decoded = [to_camera_size(codec.decode(codec.encode(to_model_size(video[[0] * 5], 48, 64)))) for video in videos]
     expected = [np.mean(psnr(made[:n], video[:n])) for made, video, n in zip(decoded, videos, (3, 5), strict=True)]
     assert ceiling.clips == 2

@@ -69,7 +69,17 @@ def test_an_open_gate_shows_the_render_of_its_frame(plain: ConvAutoencoderCodec,
 def test_an_open_gate_shows_the_first_frame(plain: ConvAutoencoderCodec) -> None:
     given = make_given()
     decoded = plain.with_head(make_head(1.0, 3)).decode(plain.encode(smooth_clip(9, frames=FRAMES)), given)
-    np.testing.assert_array_equal(decoded, np.repeat(given.first, FRAMES, axis=0))
+    np.testing.assert_array_equal(decoded, np.repeat(given.scene, FRAMES, axis=0))
+
+
+def test_a_scene_may_have_a_frame_for_each_frame(plain: ConvAutoencoderCodec) -> None:
+    """A still scene of many frames is that of one, and an open gate shows the scene of its frame."""
+    given, latents = make_given(), plain.encode(smooth_clip(9, frames=FRAMES))
+    still = given._replace(scene=given.scene.repeat(FRAMES, axis=0))
+    codec = plain.with_head(make_head())
+    np.testing.assert_array_equal(codec.decode(latents, still), codec.decode(latents, given))
+    moving = given._replace(scene=given.render[1:-1])
+    np.testing.assert_array_equal(plain.with_head(make_head(1.0, 3)).decode(latents, moving), moving.scene)
 
 
 def test_a_frame_depends_on_the_render_around_it_alone(plain: ConvAutoencoderCodec) -> None:
@@ -84,7 +94,9 @@ def test_a_frame_depends_on_the_render_around_it_alone(plain: ConvAutoencoderCod
 @pytest.mark.parametrize(("start", "expected"), [(0, [0, 0, 1, 2]), (3, [2, 3, 4, 4]), (9, [4, 4, 4, 4])])
 def test_ends_of_the_render_are_repeated(start: int, expected: list[int]) -> None:
     render = np.arange(5, dtype=np.uint8)[:, None, None, None].repeat(3, axis=-1)
-    assert given_frames(render, render[:1], start, 2).render[..., 0].ravel().tolist() == expected
+    given = given_frames(render, render[:1], start, 2)
+    assert given.render[..., 0].ravel().tolist() == expected and given.scene.ravel().tolist() == [0, 0, 0]
+    assert given_frames(render, render, start, 2).scene[..., 0].ravel().tolist() == [min(start, 4), min(start + 1, 4)]
 
 
 def test_latents_keep_their_hash_and_decoded_frames_do_not(plain: ConvAutoencoderCodec) -> None:

@@ -135,8 +135,9 @@ def test_a_network_at_its_start_predicts_the_guess_that_it_is_given() -> None:
     model = world_model(MODELS["tiny"], CHANNELS, ("map_channels",), prediction="residual", guess="map_channels")
     clean = LATENTS - model(LATENTS, {"map_channels": guess}, noise, TEXT)
     np.testing.assert_allclose(clean, guess, atol=1e-5)
-    settings = load_experiment(ROOT / "configs" / "debug.yaml", ["--model.embodiment", "pasted_render"])
-    assert settings.network.guess == "map_channels"
+    for embodiment in ("pasted_render", "carried_render"):
+        settings = load_experiment(ROOT / "configs" / "debug.yaml", ["--model.embodiment", embodiment])
+        assert settings.network.guess == "map_channels"
     assert load_experiment(ROOT / "configs" / "fixed.yaml", ["--model.embodiment", "none"]).network.guess == ""
 
 

@@ -15,7 +15,6 @@ from typing import Protocol
 import numpy as np
 
 from xew.config import ConfigError
-from xew.episode import read_pixels
 
 OPENER = "xew.model.runs.roundtrip:open_roundtrip"
 """Function of a run's folder that opens its codec."""
@@ -32,12 +31,11 @@ class Roundtrip(Protocol):
     def digest(self) -> str:
         """Text that changes whenever the video would."""
 
-    @property
-    def sees_render(self) -> bool:
-        """Whether the model's decoder is given the commanded robot's render."""
+    def __call__(self, video: np.ndarray, episode: Path) -> np.ndarray:
+        """Video [t h w 3] uint8 of the episode in a folder to what the codec leaves of it.
 
-    def __call__(self, video: np.ndarray, render: np.ndarray | None = None) -> np.ndarray:
-        """Video [t h w 3] uint8, and the render [t h w 3] uint8 if `sees_render`, to what the codec leaves of the video."""
+        Decoders that are given what a rollout is given read it from the folder.
+        """
 
 
 @dataclass(frozen=True)
@@ -55,9 +53,8 @@ class ModelCodec:
 
     def reconstruct(self, episode: Path, video: np.ndarray) -> np.ndarray:
         """What the codec leaves of an episode's video [t h w 3] uint8; in one thread at a time, since some take much memory."""
-        render = read_pixels(episode, "robot") if self.roundtrip.sees_render else None
         with self._turn:
-            return self.roundtrip(video, render)
+            return self.roundtrip(video, episode)
 
 
 def open_codec(run: Path) -> Roundtrip:

@@ -8,7 +8,7 @@ import numpy as np
 
 from xew.episode import Record
 from xew.model.codecs.contract import Codec
-from xew.model.conditions import SHOW_RENDER, Condition, clip_numbers
+from xew.model.conditions import SHOW_RENDER, Command, Condition, clip_numbers
 from xew.model.episodes.commands import episode_command
 from xew.model.settings.settings import Clip
 from xew.model.video.frames import to_model_size
@@ -41,17 +41,18 @@ def read_streams(
     record: Record,
     streams: Collection[str],
     pixels: Pixels | None = None,
+    command: Command | None = None,
 ) -> dict[str, np.ndarray]:
     """Read streams (rgb and keys of `conditions`) of an episode: [t h w 3] uint8 at the model's size or [t n] float32.
 
-    Without `pixels` the episode's videos are read.
+    Without `pixels` the episode's videos are read, without `command` its commands.
     """
     if pixels is None:
         pixels = stored_pixels(folder, record, needed_pixels(conditions, streams))
     wanted = {name: condition for name, condition in conditions.items() if name in streams}
     videos = {name: pixels["rgb"] for name in streams if name == "rgb" or wanted[name].make is None}
     if len(videos) < len(streams):
-        command = episode_command(folder, record, pixels.get("robot"), pixels.get("rgb"))
+        command = command or episode_command(folder, record, pixels.get("robot"), pixels.get("rgb"))
         videos |= {name: condition.make(command) for name, condition in wanted.items() if condition.make is not None}
     return {name: to_model_size(v, clip.height, clip.width) if v.ndim == 4 else v for name, v in videos.items()}
 

@@ -41,30 +41,35 @@ def check_lpips() -> None:
 
 
 def measure_ceiling(
-    codec: Codec, videos: Iterable[tuple[Video, Video | None]], frames: int, height: int, width: int
+    codec: Codec, videos: Iterable[tuple[Video, Video | None, Video | None]], frames: int, height: int, width: int
 ) -> Ceiling:
     """Grade the reconstruction of the first `frames` frames of each true video.
 
-    `videos` are pairs, uint8 [t 240 320 3], of the truth and the commanded robot's render, or None where the decoder gets none.
+    `videos` are the truth, the commanded robot's render and the scene (`GivenFrames`), uint8 [t 240 320 3], or None for the
+    last two where the decoder gets none.
     """
     from xew.metrics import lpips, psnr
 
     scores = []
-    for video, render in videos:
-        decoded = reconstruct(codec, video[:frames], frames, height, width, render)
+    for video, *given in videos:
+        decoded = reconstruct(codec, video[:frames], frames, height, width, *given)
         pair = jnp.asarray(decoded), jnp.asarray(video[:frames])
         scores.append((np.mean(psnr(*pair)), np.mean(lpips(*(video[::LPIPS_EVERY] for video in pair)))))
     means = np.mean(scores, axis=0)
     return Ceiling(float(means[0]), float(means[1]), len(scores))
 
 
-def reconstruct(codec: Codec, truth: Video, frames: int, height: int, width: int, render: Video | None = None) -> Video:
+def reconstruct(
+    codec: Codec, truth: Video, frames: int, height: int, width: int, render: Video | None = None, scene: Video | None = None
+) -> Video:
     """Reconstruction of a video of at most `frames` frames by the codec, at the camera's size: [t 240 320 3] uint8.
 
-    A shorter video is padded with its last frame for the codec. With a render, the decoder is given what a rollout is given.
+    A shorter video is padded with its last frame for the codec. With a render, the decoder is given what a rollout
+    is given; without a scene, the first frame is the scene.
     """
     clip = to_model_size(truth[np.minimum(np.arange(frames), len(truth) - 1)], height, width)
-    given = None if render is None else given_frames(to_model_size(render, height, width), clip[:1], 0, frames)
+    shown = clip[:1] if scene is None else to_model_size(scene, height, width)
+    given = None if render is None else given_frames(to_model_size(render, height, width), shown, 0, frames)
     return to_camera_size(codec.decode(codec.encode(clip), given))[: len(truth)]
 
 

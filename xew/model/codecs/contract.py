@@ -51,8 +51,8 @@ class GivenFrames(NamedTuple):
 
     render: Any
     """[b t+2 h w 3] uint8, the commanded robot on white, from one frame before the first to one after the last."""
-    first: Any
-    """[b 1 h w 3] uint8, first frame of the episode."""
+    scene: Any
+    """[b t h w 3] uint8, the scene around the robot, from commands and first frame alone; or [b 1 h w 3], the first frame."""
 
 
 class LatentSize(NamedTuple):
@@ -100,7 +100,7 @@ class Codec(ABC):
 
     def decode(self, latents: Latents, given: GivenFrames | None = None) -> Pictures:
         """Latents float32 [t' h' w' c] -> video uint8 [t h w 3]; `given` has no axis of videos."""
-        batched = None if given is None else GivenFrames(given.render[None], given.first[None])
+        batched = None if given is None else GivenFrames(given.render[None], given.scene[None])
         return np.asarray(decode_to_pictures(self, latents[None], batched))[0]
 
     @abstractmethod
@@ -150,14 +150,16 @@ def decode_to_pictures(codec: Any, latents: LatentBatch, given: GivenFrames | No
     return to_pictures(codec.decode_batch(latents, given))
 
 
-def given_frames(render: Pictures, first: UInt8[np.ndarray, "1 h w 3"], start: int, frames: int) -> GivenFrames:
-    """What a rollout is given of `frames` frames of an episode from `start` on: no axis of videos.
+def given_frames(render: Any, scene: Any, start: int, frames: int) -> GivenFrames:
+    """What a rollout is given of `frames` frames of episodes from `start` on.
 
     Args:
-        render: [t h w 3] uint8, the commanded robot in the whole episode; its ends are repeated.
-        first: [1 h w 3] uint8, first frame of the episode.
+        render: [... t h w 3] uint8, the commanded robot in the whole episode; its ends are repeated.
+        scene: [... t h w 3] uint8, the scene in the whole episode, whose end is repeated; or [... 1 h w 3], its first frame.
     """
-    return GivenFrames(render[np.clip(np.arange(start - 1, start + frames + 1), 0, len(render) - 1)], first)
+    around = np.clip(np.arange(start - 1, start + frames + 1), 0, render.shape[-4] - 1)
+    shown = np.clip(np.arange(start, start + (frames if scene.shape[-4] > 1 else 1)), 0, scene.shape[-4] - 1)
+    return GivenFrames(render[..., around, :, :, :], scene[..., shown, :, :, :])
 
 
 def to_signed(pictures: UInt8[Array, "*n"]) -> Float[Array, "*n"]:

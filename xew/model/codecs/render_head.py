@@ -1,10 +1,10 @@
-"""A head behind the decoder that sees what every rollout is given: the commanded render and the episode's first frame.
+"""A head behind the decoder that sees what every rollout is given: the commanded render and the scene, or its first frame.
 
 Reads  decoded frames [b t h w 3] in [-1, 1], and `GivenFrames`
 Writes frames [b t h w 3] in [-1, 1]
 
 A codec of a few numbers per pixel cannot keep a robot's edges. A rollout knows them: they are in the render of its commands.
-The head mixes the render and the first frame into what was decoded, and corrects the rest. It begins as the identity. An arm
+The head mixes the render and the scene into what was decoded, and corrects the rest. It begins as the identity. An arm
 lags its command, so the head is given the render one frame earlier and later too. A U-Net (Ronneberger et al., arXiv
 1505.04597) over squares of two pixels lets it see where objects, shadows and occlusion overrule the render.
 
@@ -29,7 +29,7 @@ Frames = Float[Array, "b t h w 3"]
 WHITE = 0.96
 """Least value of all channels, in [-1, 1], of the white ground of a render."""
 SOURCES = 4
-"""Pictures that are mixed in: the render of the frame before, of the frame, of the frame after, and the first frame."""
+"""Pictures that are mixed in: the render of the frame before, of the frame, of the frame after, and the scene."""
 
 
 @dataclass(frozen=True)
@@ -65,8 +65,8 @@ class RenderHead(nnx.Module):
     def __call__(self, decoded: Frames, given: GivenFrames) -> Frames:
         """Decoded frames [b t h w 3] in [-1, 1] -> frames [b t h w 3] in [-1, 1]; the sides are multiples of 8."""
         b, t, h, w, _ = decoded.shape
-        render, first = to_signed(given.render), to_signed(given.first)
-        sources = [render[:, :-2], render[:, 1:-1], render[:, 2:], jnp.broadcast_to(first, decoded.shape)]
+        render, scene = to_signed(given.render), to_signed(given.scene)
+        sources = [render[:, :-2], render[:, 1:-1], render[:, 2:], jnp.broadcast_to(scene, decoded.shape)]
         masks = [robot_pixels(render) for render in sources[:-1]]
         stacked = jnp.concatenate([decoded, *sources, *masks], axis=-1).reshape(b * t, 1, h, w, -1)
         features = self._unet(patchify(stacked.astype(self.dtype), 2)[:, 0])

@@ -5,9 +5,12 @@ from pathlib import Path
 
 import numpy as np
 
+from xew.episode import read_record
 from xew.model.cache.clips import gives_render
 from xew.model.cache.store import load_codec
 from xew.model.codecs.contract import Codec, given_frames
+from xew.model.conditions import shown_scene, shows_carried
+from xew.model.episodes.commands import episode_command
 from xew.model.experiment import Experiment, load_experiment
 from xew.model.runs.folder import load_run
 from xew.model.video.frames import to_camera_size, to_model_size
@@ -31,14 +34,15 @@ class RunRoundtrip:
     @property
     def digest(self) -> str:
         """Identifier of the codec and its picture size."""
-        return f"{self.codec.decoder_hash} {self.experiment.clip.height}x{self.experiment.clip.width}"
+        carried = " carried" if self.sees_render and shows_carried(self.experiment.conditions.values()) else ""
+        return f"{self.codec.decoder_hash} {self.experiment.clip.height}x{self.experiment.clip.width}{carried}"
 
     @property
     def sees_render(self) -> bool:
         """Whether the model's decoder is given the commanded robot's render."""
         return gives_render(self.codec, self.experiment.conditions)
 
-    def __call__(self, video: np.ndarray, render: np.ndarray | None = None) -> np.ndarray:
+    def __call__(self, video: np.ndarray, episode: Path | None = None) -> np.ndarray:
         """Reconstruct a video [t h w 3] uint8 of any length: [t h w 3] uint8.
 
         Videos are padded to a multiple of LENGTH_BLOCK frames after the first, to share compiled programs. A codec of
@@ -46,21 +50,28 @@ class RunRoundtrip:
 
         Args:
             video: of the episode.
-            render: [t h w 3] uint8, its commanded robot on white, if `sees_render`.
+            episode: its folder, from which the render and the scene are read if `sees_render`.
         """
         clip = self.experiment.clip
         padded = np.concatenate([video, np.repeat(video[-1:], -(len(video) - 1) % LENGTH_BLOCK, axis=0)])
         small = to_model_size(padded, clip.height, clip.width)
         block = LENGTH_BLOCK if self.codec.groups_independent else len(small) - 1
-        robot = None if render is None else to_model_size(render, clip.height, clip.width)
-        coded = [self._code(small, robot, start, block) for start in range(0, max(len(small) - 1, 1), max(block, 1))]
+        given = self._read_given(episode) if episode is not None and self.sees_render else None
+        coded = [self._code(small, given, start, block) for start in range(0, max(len(small) - 1, 1), max(block, 1))]
         return to_camera_size(np.concatenate([coded[0][:1], *(piece[1:] for piece in coded)])[: len(video)])
 
-    def _code(self, video: np.ndarray, render: np.ndarray | None, start: int, block: int) -> np.ndarray:
+    def _read_given(self, episode: Path) -> tuple[np.ndarray, np.ndarray]:
+        """Render [t h w 3] and scene [t h w 3] or [1 h w 3] of an episode, uint8 at the model's size."""
+        command = episode_command(episode, read_record(episode))
+        videos = command.render, shown_scene(self.experiment.conditions.values(), command)
+        render, scene = (to_model_size(video, self.experiment.clip.height, self.experiment.clip.width) for video in videos)
+        return render, scene
+
+    def _code(self, video: np.ndarray, given: tuple[np.ndarray, np.ndarray] | None, start: int, block: int) -> np.ndarray:
         """Code frame 0 and `block` frames [t h w 3] after frame `start`: [block+1 h w 3]."""
-        given = None if render is None else given_frames(render, video[:1], start, block + 1)
+        pictures = None if given is None else given_frames(*given, start, block + 1)
         piece = np.concatenate([video[:1], video[start + 1 : start + 1 + block]])
-        return self.codec.decode(self.codec.encode(piece), given)
+        return self.codec.decode(self.codec.encode(piece), pictures)
 
 
 def open_roundtrip(run: Path) -> RunRoundtrip:

@@ -25,13 +25,14 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from xew.concurrency import map_in_order
 from xew.config import pick
 from xew.dataset import Episode
-from xew.episode import read_pixels
+from xew.episode import Record, read_pixels
 from xew.model.cache.clips import gives_render, needed_pixels, read_streams, take_frames
 from xew.model.cache.scales import Scale, apply_scales
 from xew.model.codecs.contract import Codec, GivenFrames, encode_pictures, given_frames, to_pictures, to_signed
-from xew.model.conditions import Condition, clip_numbers
+from xew.model.conditions import Condition, clip_numbers, shown_scene
 from xew.model.devices.sharding import batch_sharding, replicated_sharding
 from xew.model.diffusion.samplers import SAMPLERS, NoiseSchedule
+from xew.model.episodes.commands import episode_command
 from xew.model.experiment import Experiment
 from xew.model.network.dit import WorldModel, cast_params, network_graph
 from xew.model.settings.parts import ClipInputs
@@ -41,9 +42,12 @@ from xew.model.video.frames import to_model_size
 from xew.model.video.pixels import stored_pixels
 
 Streams = dict[str, np.ndarray]
-"""Inputs of one whole episode by stream: uint8 [t h w 3] or float32 [t n]; with FIRST and, for some decoders, RENDER."""
+"""Inputs of one whole episode by stream: uint8 [t h w 3] or float32 [t n]; with FIRST and, for some decoders, RENDER, SCENE."""
+EpisodeInputs = tuple[Record, Streams]
+"""An episode that was read."""
 FIRST = "first frame"
 RENDER = "render"
+SCENE = "scene"
 
 
 class ChunkInputs(NamedTuple):
@@ -57,10 +61,12 @@ class ChunkInputs(NamedTuple):
     """[b l e] or [b l]."""
     negative: Array | None
     """The same of the negative prompt, or None without guidance."""
-    keys: Array
-    """[b 2] uint32, data of random keys."""
+    names: Array
+    """[b] uint32, numbers of the episodes, for their noise."""
+    chunk: Array | int
+    """Number of the chunk."""
     given: GivenFrames | None = None
-    """Render and first frame for the codec's decoder, or None."""
+    """Render and scene for the codec's decoder, or None."""
 
 
 class ChunkSampling(NamedTuple):
@@ -70,6 +76,7 @@ class ChunkSampling(NamedTuple):
     schedule: NoiseSchedule
     guidance: float
     latent_shape: tuple[int, ...]
+    seed: int
 
 
 class Prediction(NamedTuple):
@@ -106,79 +113,101 @@ class Predictor:
 
         Frame 0 is the codec's reconstruction of the first frame. Results do not depend on the batch.
         """
-        return self.begin(episodes, frame_count).fetch()
+        return self.begin(list(map_in_order(self.read, episodes)), frame_count).fetch()
 
-    def begin(self, episodes: Sequence[Episode], frame_count: int, batch: int = 1) -> Prediction:
-        """Start `predict` without waiting for the devices.
+    def begin(self, episodes: Sequence[EpisodeInputs], frame_count: int, batch: int = 1) -> Prediction:
+        """Start to predict the first `frame_count` frames of episodes that were read, without waiting for the devices.
 
         The last episode is repeated to fill `batch` and the devices, so no smaller batch is compiled.
         """
         size = max(len(episodes), batch)
         size += -size % self._devices
         padded = [*episodes, *[episodes[-1]] * (size - len(episodes))]
-        streams = list(map_in_order(self._read, episodes))
-        streams += streams[-1:] * (size - len(episodes))
-        text, negative = self._encode_text(padded)
-        first = self._place(np.stack([stream[FIRST] for stream in streams]))
-        unaligned = self._encode_unaligned(streams)
-        sampling = ChunkSampling(self.settings.sampler, self.schedule, self.settings.guidance, self.inputs.latent_shape)
+        records, streams = [record for record, _ in padded], self._stack([streams for _, streams in padded], frame_count)
+        text, negative = self._encode_text(records)
+        names = self._place(np.array([name_number(record) for record in records], np.uint32))
+        unaligned, sampling = self._encode_unaligned(streams), self._sampling
         chunks: list[Array] = []
         for number, start in enumerate(range(0, max(frame_count - 1, 1), self.inputs.clip.frames - 1)):
-            conditions = unaligned | self._encode_history(first, chunks, start) | self._encode_conditions(streams, start)
-            keys = self._place(np.stack([self._key(episode, number) for episode in padded]))
-            reference = chunks[-1][:, -1:] if chunks else first
-            inputs = ChunkInputs(reference, conditions, text, negative, keys, self._give_frames(streams, start))
+            history = self._encode_history(streams[FIRST], chunks, start)
+            conditions = unaligned | history | self._encode_conditions(streams, start)
+            reference, given = chunks[-1][:, -1:] if chunks else streams[FIRST], self._give_frames(streams, start)
+            inputs = ChunkInputs(reference, conditions, text, negative, names, number, given)
             with jax.set_mesh(self._mesh) if self._mesh is not None else nullcontext():
                 chunks.append(predict_chunk(self.graph, self.params, self.codec, inputs, sampling))
         return Prediction(chunks, len(episodes), frame_count)
 
-    def _read(self, episode: Episode) -> Streams:
-        """The first frame of an episode, and its conditions."""
+    @property
+    def _sampling(self) -> ChunkSampling:
+        settings = self.settings
+        return ChunkSampling(settings.sampler, self.schedule, settings.guidance, self.inputs.latent_shape, settings.seed)
+
+    def read(self, episode: Episode) -> EpisodeInputs:
+        """Read the first frame of an episode and its conditions; threads may call it."""
         inputs, (folder, record), clip = self.inputs, episode, self.inputs.clip
         names = [name for name, condition in inputs.conditions.items() if condition.make is not None]
         pixels = stored_pixels(folder, record, needed_pixels(inputs.conditions, names))
+        command = episode_command(folder, record, pixels.get("robot"), pixels.get("rgb"))
         given = {FIRST: read_pixels(folder, "rgb", most=1, record=record)}
         if gives_render(self.codec, inputs.conditions):
-            given[RENDER] = pixels["robot"]
+            given |= {RENDER: pixels["robot"], SCENE: shown_scene(inputs.conditions.values(), command)}
         resized = {name: to_model_size(video, clip.height, clip.width) for name, video in given.items()}
-        return resized | read_streams(inputs.conditions, clip, folder, record, names, pixels)
+        return record, resized | read_streams(inputs.conditions, clip, folder, record, names, pixels, command)
 
-    def _give_frames(self, streams: Sequence[Streams], start: int) -> GivenFrames | None:
+    def _stack(self, episodes: Sequence[Streams], frame_count: int) -> dict[str, Any]:
+        """Streams of a batch: numbers [b t n], which the host cuts, and pictures [b t h w 3] on the devices.
+
+        Of pictures that follow the episode the last is repeated to the end of the last chunk, so few lengths are compiled.
+        """
+        step = self.inputs.clip.frames - 1
+        frames = max(-(-(frame_count - 1) // step), 1) * step + 1
+
+        def join(name: str) -> Any:
+            arrays = [streams[name] for streams in episodes]
+            if arrays[0].ndim == 2:
+                return arrays
+            still = name in (FIRST, SCENE) and all(len(video) == 1 for video in arrays)
+            if still or (name in self.inputs.conditions and not self.inputs.conditions[name].aligned):
+                return self._place(np.stack(arrays))
+            follows = frames + (name == RENDER)  # the decoder looks one frame ahead
+            return self._place(np.stack([take_frames(video, 0, follows) for video in arrays]))
+
+        return {name: join(name) for name in episodes[0]}
+
+    def _give_frames(self, streams: Mapping[str, Any], start: int) -> GivenFrames | None:
         """What the decoder is given of the chunk that begins at frame `start`."""
-        if not gives_render(self.codec, self.inputs.conditions):
+        if RENDER not in streams:
             return None
-        given = [given_frames(stream[RENDER], stream[FIRST], start, self.inputs.clip.frames) for stream in streams]
-        return GivenFrames(*(self._place(np.stack(videos)) for videos in zip(*given, strict=True)))
+        return given_frames(streams[RENDER], streams[SCENE], start, self.inputs.clip.frames)
 
-    def _encode_text(self, episodes: Sequence[Episode]) -> tuple[Any, Any]:
+    def _encode_text(self, records: Sequence[Record]) -> tuple[Any, Any]:
         """Encode the instructions and, with guidance, as many negative prompts."""
         settings = self.settings
-        instructions = [record.instruction for _, record in episodes]
+        instructions = [record.instruction for record in records]
         encoded = self.instructions.encode(instructions)
         text = self._place(np.stack([encoded[instruction] for instruction in instructions]))
         if settings.guidance == 1:
             return text, None
         negative = self.instructions.encode([settings.negative_prompt])[settings.negative_prompt]
-        return text, self._place(np.stack([negative] * len(episodes)))
+        return text, self._place(np.stack([negative] * len(records)))
 
-    def _encode_unaligned(self, streams: Sequence[Streams]) -> dict[str, Array]:
+    def _encode_unaligned(self, streams: Mapping[str, Any]) -> dict[str, Array]:
         """Encode the pictures that every chunk reuses."""
         return {
-            name: encode_pictures(self.codec, self._place(np.stack([stream[name] for stream in streams])))
+            name: encode_pictures(self.codec, streams[name])
             for name, condition in self.inputs.conditions.items()
-            if _is_picture(condition, streams[0].get(name)) and not condition.aligned
+            if _is_picture(condition, streams.get(name)) and not condition.aligned
         }
 
-    def _encode_conditions(self, streams: Sequence[Streams], start: int) -> dict[str, Array]:
+    def _encode_conditions(self, streams: Mapping[str, Any], start: int) -> dict[str, Array]:
         """Encode aligned conditions of the chunk that begins at frame `start`."""
         frames, history = self.inputs.clip.frames, self.inputs.history
         pictures, numbers = {}, {}
         for name, condition in self.inputs.conditions.items():
-            if _is_picture(condition, streams[0].get(name)) and condition.aligned:
-                clips = [take_frames(stream[name], start, frames) for stream in streams]
-                pictures[name] = encode_pictures(self.codec, self._place(np.stack(clips)))
-            elif name in streams[0] and streams[0][name].ndim == 2:
-                numbers[name] = np.stack([clip_numbers(condition, s[name], start, frames, history) for s in streams])
+            if _is_picture(condition, streams.get(name)) and condition.aligned:
+                pictures[name] = encode_pictures(self.codec, jax.lax.dynamic_slice_in_dim(streams[name], start, frames, axis=1))
+            elif isinstance(streams.get(name), list):
+                numbers[name] = np.stack([clip_numbers(condition, whole, start, frames, history) for whole in streams[name]])
         scaled = apply_scales(self.scales, self.inputs.conditions, numbers)
         return pictures | {name: self._place(array) for name, array in scaled.items()}
 
@@ -191,12 +220,6 @@ class Predictor:
         earlier = np.maximum(start + np.asarray(self.inputs.history), 0)
         encoded = [encode_pictures(self.codec, past[:, frame : frame + 1]) for frame in earlier]
         return dict.fromkeys(names, jnp.concatenate(encoded, axis=1))
-
-    def _key(self, episode: Episode, chunk: int) -> np.ndarray:
-        _, record = episode
-        name = zlib.crc32(f"{record.task}/{record.seed}/{record.robot}".encode())
-        key = jax.random.fold_in(jax.random.fold_in(jax.random.key(self.settings.seed), name), chunk)
-        return np.asarray(jax.random.key_data(key))
 
     @property
     def _mesh(self) -> Mesh | None:
@@ -227,11 +250,21 @@ def predict_chunk(graph: nnx.GraphDef, params: Any, codec: Any, inputs: ChunkInp
     """Predict one chunk of every episode of a batch: uint8 [b t h w 3]."""
     model = nnx.merge(graph, cast_params(graph, params))
     reference = codec.encode_batch(to_signed(inputs.reference))
-    keys = jax.random.wrap_key_data(inputs.keys)
-    noise = jax.vmap(lambda key: jax.random.normal(key, sampling.latent_shape, jnp.float32))(keys)
+    noise = jax.vmap(lambda name: draw_noise(name, inputs.chunk, sampling))(inputs.names)
     velocity, sampler = guided_velocity(model, inputs, sampling.guidance), pick(SAMPLERS, sampling.sampler, "sampler")
     frames = to_pictures(codec.decode_batch(sampler(velocity, reference, noise, sampling.schedule), inputs.given))
     return jax.lax.with_sharding_constraint(frames, PartitionSpec()) if jax.process_count() > 1 else frames
+
+
+def name_number(record: Record) -> int:
+    """Number of an episode by its task, seed and robot."""
+    return zlib.crc32(f"{record.task}/{record.seed}/{record.robot}".encode())
+
+
+def draw_noise(name: Array, chunk: Array | int, sampling: ChunkSampling) -> Array:
+    """Noise [t h w c] float32 of a chunk of an episode; traced, because fetching a key would wait for all chunks before it."""
+    key = jax.random.fold_in(jax.random.fold_in(jax.random.key(sampling.seed), name), chunk)
+    return jax.random.normal(key, sampling.latent_shape, jnp.float32)
 
 
 def guided_velocity(model: WorldModel, inputs: ChunkInputs, guidance: float) -> Callable[[Array, Array], Array]:
@@ -253,5 +286,6 @@ def _make_velocity(model: WorldModel, conditions: Mapping[str, Array], text: Arr
     return lambda latents, level: model(latents, conditions, level, text, cache)
 
 
-def _is_picture(condition: Condition, video: np.ndarray | None) -> bool:
-    return condition.make is not None and video is not None and video.ndim == 4
+def _is_picture(condition: Condition, stream: Any) -> bool:
+    """Whether a stream of a batch is pictures [b t h w 3] of a condition, not numbers of each episode."""
+    return condition.make is not None and stream is not None and not isinstance(stream, list)
