@@ -378,7 +378,7 @@ def test_the_registry_of_metrics_is_complete() -> None:
 def test_an_entry_of_the_registry_of_metrics_agrees_with_its_function() -> None:
     metrics = importlib.import_module("xew.metrics")
     kinds = importlib.import_module("xew.metrics.metric")
-    masked = {kind: ["target_mask"] for kind in ("region", "robot")}
+    masked = {kind: ["target_mask"] for kind in ("region", "robot", "bodies")}
     others: dict[str, list[str]] = {"video": [], "mask": [], "track": ["valid"]} | masked
     assert set(others) == set(kinds.INPUTS)
     for name, metric in metrics.METRICS.items():
@@ -390,6 +390,7 @@ def test_an_entry_of_the_registry_of_metrics_agrees_with_its_function() -> None:
         assert (metric.curve is None) == (metric.inputs == "track"), name
         assert metric.range[0] < metric.range[1] and metric.dimension and metric.reference, name
         assert metric.suites and set(metric.suites) <= set(kinds.SUITES) and metric.points in kinds.POINTS, name
-        assert metric.by_image == ("side" in inspect.signature(metric.function).parameters), name
+        options = inspect.signature(metric.function).parameters
+        assert set(metric.options) == set(kinds.OPTIONS) & set(options), name
     titles = [metric.title or name for name, metric in metrics.METRICS.items()]
     assert len(set(titles)) == len(titles)

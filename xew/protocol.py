@@ -142,7 +142,7 @@ SHOTS = (1, 2, 3)
 """Numbers of training episodes per task for few-shot adaptation (M), from the first accepted seeds."""
 FORGETTING_ROBOT = "ur5_wsg"
 """Robot whose test episodes measure forgetting, the same for every adapted model."""
-GRADING_PROTOCOL = 6
+GRADING_PROTOCOL = 7
 """Version of the grading. It increases with every change of scores; scores of another version are graded again."""
 COPY_FIRST_FRAME, PASTED_RENDER, OTHER_ROBOT = "copy_first_frame", "pasted_render", "other_robot"
 CODEC_TRUTH, GROUND_TRUTH = "codec_truth", "ground_truth"

@@ -14,7 +14,7 @@ Predictors: videos made on purpose, from the true one to a gray one, and whether
     python -m lab.calibration --data data --predictors --out calibration
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations, zip_longest
 from pathlib import Path
@@ -27,7 +27,7 @@ from tqdm import tqdm
 
 from lab.calibration.matrix import grade_predictors, matrix, to_markdown
 from lab.calibration.perturbations import Perturbation, render_perturbations
-from lab.calibration.predictors import PREDICTORS
+from lab.calibration.predictors import APPEARANCES, PREDICTORS, Material, predict
 from xew.config import ConfigError, admit, suggestion, user_errors
 from xew.dataset import demand_one_motion, find_accepted
 from xew.episode import EpisodeError, Record, read_pixels
@@ -36,7 +36,7 @@ from xew.metrics import METRICS
 from xew.metrics.backends import Masker, Tracker, open_masker, open_tracker
 from xew.metrics.episode_cache import EpisodeCache
 from xew.metrics.grade import Comparison, Grades, grade, input_kind
-from xew.metrics.grading.codecs import open_codec
+from xew.metrics.grading.codecs import ModelCodec, open_codecs
 from xew.metrics.truth import NEEDS, Truth, read_truth
 from xew.protocol import seed_split
 
@@ -108,27 +108,27 @@ def main(args: Args) -> None:
         near = suggestion(unknown[0], PREDICTORS)
         raise ConfigError(f"unknown predictor {unknown[0]!r};{near} known: {', '.join(PREDICTORS)}: --cases.")
     estimators = Estimators(open_masker(args.masks, args.masks_checkpoint), open_tracker(args.tracks, args.tracks_checkpoint))
-    through_codec = None if args.codec is None else open_codec(args.codec)
+    codec = None if args.codec is None else next(iter(open_codecs((args.codec,)).values()))
     episodes = find_accepted(args.data)
     demand_one_motion(args.data, (record for _, record in episodes))
     with hold_lock(args.out):
         if args.predictors:
             print(grade_matrix(episodes, args, estimators))
         else:
-            print(grade_references(episodes, args, estimators, through_codec))
+            print(grade_references(episodes, args, estimators, codec))
 
 
 def grade_references(
     episodes: Sequence[Episode],
     args: Args,
     estimators: Estimators,
-    through_codec: Callable[[np.ndarray], np.ndarray] | None,
+    codec: ModelCodec | None,
 ) -> str:
     """Grade references and wrong motions on the chosen episodes, write rows and both tables, and return these in Markdown."""
     tables = {name: pd.DataFrame() for name in ("references", "wrong", "frames")}
     text = ""
     for episode in tqdm(choose(episodes, args), desc="calibrate", unit="episode", disable=None):
-        for name, table in calibrate(episode, episodes, estimators, through_codec).items():
+        for name, table in calibrate(episode, episodes, estimators, codec).items():
             tables[name] = pd.concat([tables[name], table], ignore_index=True)
         text = report(**tables)
         write(args.out, text, tables)  # each time, so a stopped run has written something
@@ -152,7 +152,7 @@ def calibrate(
     episode: Episode,
     episodes: Sequence[Episode],
     estimators: Estimators,
-    through_codec: Callable[[np.ndarray], np.ndarray] | None = None,
+    codec: ModelCodec | None = None,
 ) -> dict[str, pd.DataFrame]:
     """The rows of one of the episodes: references (KEY metric value), wrong (KEY metric estimate truth), frames (by frame)."""
     folder, record = episode
@@ -161,7 +161,7 @@ def calibrate(
     references: list[Row] = []
     wrong: list[Row] = []
     frames: list[pd.DataFrame] = []
-    for case, video in reference_videos(episodes, record, truth, through_codec):
+    for case, video in reference_videos(episodes, episode, truth, codec):
         values = estimators.grade(video, truth, tuple(METRICS)).values
         references += [key | {"case": case, "metric": name, "value": value} for name, value in values.items()]
     for case, wrong_motion in render_perturbations(folder):
@@ -200,19 +200,25 @@ def _take_turns(episodes: Sequence[Episode]) -> list[Episode]:
 
 
 def reference_videos(
-    episodes: Sequence[Episode], record: Record, truth: Truth, through_codec: Callable[[np.ndarray], np.ndarray] | None
+    episodes: Sequence[Episode], episode: Episode, truth: Truth, codec: ModelCodec | None
 ) -> Iterator[tuple[str, np.ndarray]]:
     """Videos to grade as predictions of an episode, by the name of the case, each uint8 [t h w 3]."""
+    folder, record = episode
     frames = np.arange(len(truth.rgb))
     yield "truth itself", truth.rgb
-    if through_codec is not None:
-        yield "truth through the codec", through_codec(truth.rgb)
+    if codec is not None:
+        yield "truth through the codec", codec.reconstruct(folder, truth.rgb)
     yield "frozen first frame", truth.rgb[np.zeros_like(frames)]
     yield f"truth {LATE} frames late", truth.rgb[np.maximum(frames - LATE, 0)]
+    material = Material(truth.rgb, robot=truth.labels == 0, objects=truth.labels > 0)
+    for case in APPEARANCES:
+        video = predict(case, material)
+        if video is not None:
+            yield case, video
     for differs in ("robot", "seed"):
-        folder = find_another(episodes, record, differs)
-        if folder is not None:
-            video = read_pixels(folder, "rgb")
+        other = find_another(episodes, record, differs)
+        if other is not None:
+            video = read_pixels(other, "rgb")
             yield f"another {differs}", video[np.minimum(frames, len(video) - 1)]
 
 
@@ -263,13 +269,15 @@ def report(references: pd.DataFrame, wrong: pd.DataFrame, frames: pd.DataFrame) 
         f"Means over {episodes} episodes: {', '.join(sorted(wrong['task'].unique()))}; robots "
         f"{', '.join(sorted(wrong['robot'].unique()))}.",
         "### References",
-        _markdown(reference_table(references)),
+        as_markdown(reference_table(references)),
+        "### Wrong appearance: error of found points [px] (share that was found), of the robot; of objects; mask IoU",
+        as_markdown(appearance_table(references)),
         "### Wrong motions: estimate (truth)",
-        _markdown(wrong_table(wrong, frames)),
+        as_markdown(wrong_table(wrong, frames)),
         "### Wrong motions, frame by frame: mean difference of the estimate from the truth (mean of its absolute value)",
-        _markdown(motion_table(frames)),
+        as_markdown(motion_table(frames)),
         "### Order",
-        _markdown(order_table(wrong)),
+        as_markdown(order_table(wrong)),
     ]
     return "\n\n".join(parts) + "\n"
 
@@ -278,6 +286,23 @@ def reference_table(references: pd.DataFrame) -> pd.DataFrame:
     """Mean of each metric (rows) on each reference (columns); both in their own order."""
     table = references.groupby(["metric", "case"])["value"].mean().unstack()
     return table.loc[list(METRICS), list(references["case"].unique())].map("{:.3f}".format)
+
+
+def appearance_table(rows: pd.DataFrame) -> pd.DataFrame:
+    """What the estimators make of each robot (columns) in the true motion and each wrong appearance (rows).
+
+    Args:
+        rows: task, seed, robot, case, metric and value, of references or of predictors.
+    """
+    cases = [case for case in ("truth itself", "truth", *APPEARANCES) if case in set(rows["case"])]
+    means = rows.groupby(["case", "robot", "metric"])["value"].mean().unstack()
+    cell = (
+        "{keypoint_error_found:.2f} ({coverage_strict:.2f}); {trajectory_error_found:.2f} ({object_coverage_strict:.2f}); "
+        "{mask_iou:.3f}"
+    )
+    robots = sorted(set(rows["robot"]))
+    cells = {case: [cell.format(**means.loc[(case, robot)]) for robot in robots] for case in cases}
+    return pd.DataFrame.from_dict(cells, orient="index", columns=robots)
 
 
 def wrong_table(wrong: pd.DataFrame, frames: pd.DataFrame) -> pd.DataFrame:
@@ -327,7 +352,7 @@ def _keeps_order(table: pd.DataFrame, apart: float) -> Iterator[bool]:
             yield bool((a["truth"] - b["truth"]) * (a["estimate"] - b["estimate"]) > 0)
 
 
-def _markdown(table: pd.DataFrame) -> str:
+def as_markdown(table: pd.DataFrame) -> str:
     """A table of texts, its index first."""
     lines = [["", *map(str, table.columns)], ["---"] * (1 + len(table.columns))]
     lines += [[str(name), *map(str, row)] for name, row in zip(table.index, table.to_numpy(), strict=True)]

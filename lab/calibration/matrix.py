@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from lab.calibration.predictors import PREDICTORS, Material, predict, render_objects
+from lab.calibration.predictors import PREDICTORS, Material, predict, render_material
 from xew.episode import Record, read_pixels
 from xew.metrics import METRICS
 from xew.metrics.backends import Masker, Tracker
@@ -29,8 +29,44 @@ STEPS: tuple[tuple[str, ...], ...] = (
     ("gray",),
 )
 """Predictors from right to wrong; predictors of one step are not compared with each other."""
-FURTHER = (("object at rest", "object erased"),)
-"""Further pairs, the better one first, for metrics of objects."""
+MILD = (
+    "grain",
+    "brighter",
+    "darker",
+    "tinted",
+    "robot recolored",
+    "object recolored",
+    "flicker",
+    "jitter",
+    "ghost",
+    "every 5th blank",
+    "grippers open",
+    "fails at the end",
+)
+"""Predictors whose robot moves as it should: each is better than a frozen video."""
+FURTHER = (
+    *((case, "frozen") for case in MILD),
+    ("brighter", "every 5th blank"),
+    ("2 frames late", "8 frames early"),
+    ("object recolored", "object erased"),
+    ("robot recolored", "other robot"),
+)
+"""Further pairs as a person would order them, the better one first."""
+OF_OBJECTS = (("object at rest", "object erased"), ("fails at the end", "object at rest"))
+"""Further pairs of metrics of objects."""
+OWN_PAIRS: dict[str, tuple[tuple[str, str], ...]] = {
+    "flicker": (("codec", "flicker"), ("brighter", "flicker"), ("codec", "jitter"), ("codec", "every 5th blank")),
+    "flicker_robot": (("codec", "flicker"), ("brighter", "flicker"), ("codec", "jitter")),
+    "ghosts": (("codec", "ghost"), ("codec", "every 5th blank"), ("8 frames late", "frozen")),
+    "gripper_error": (("codec", "grippers open"), ("codec", "2 frames late")),
+    "final_object_error": (("codec", "fails at the end"), ("codec", "object at rest"), ("2 frames late", "8 frames late")),
+    "onset_shift": (("codec", "2 frames late"), ("codec", "8 frames early"), ("8 frames late", "object at rest")),
+    "keypoint_error_found": (("truth", "codec"), ("codec", "2 frames late"), ("robot recolored", "2 frames late")),
+    "coverage_strict": (("codec", "2 frames late"), ("robot recolored", "other robot")),
+    "trajectory_error_found": (("codec", "2 frames late"), ("object recolored", "2 frames late")),
+    "object_coverage_strict": (("object recolored", "object at rest"), ("object at rest", "object erased")),
+}
+"""Pairs that a metric of one fault is made for, the better one first."""
 
 Episode = tuple[Path, Record]
 Row = dict[str, Any]
@@ -54,9 +90,10 @@ def grade_predictors(
         metrics: names of METRICS.
         cases: names of PREDICTORS.
     """
-    truth = read_truth(folder, record.frame_count, {input_kind(name) for name in metrics})
-    still, erased = render_objects(folder) if {"object at rest", "object erased"} & set(cases) else (None, None)
-    material = Material(truth.rgb, None if other is None else _cut(read_pixels(other, "rgb"), truth), still, erased)
+    truth = read_truth(folder, record.frame_count, {input_kind(name) for name in metrics} | {"bodies"})
+    other_robot = None if other is None else _cut(read_pixels(other, "rgb"), truth)
+    rendered = render_material(folder, cases)
+    material = Material(truth.rgb, other_robot, robot=truth.labels == 0, objects=truth.labels > 0, **rendered)
     key = {"task": record.task, "seed": record.seed, "robot": record.robot}
     return [key | row for row in grade_material(material, truth, masker, tracker, metrics, cases)]
 
@@ -105,18 +142,18 @@ def order_violations(table: pd.DataFrame) -> dict[str, list[tuple[str, str]]]:
         metric = METRICS[str(name)]
         sign = 1 if metric.higher_is_better else -1
         value = sign * table.loc[name]
-        pairs = expected_order(metric.dimension == "objects")
+        pairs = dict.fromkeys([*expected_order(metric.dimension == "objects"), *OWN_PAIRS.get(str(name), ())])
         violations[str(name)] = [(a, b) for a, b in pairs if {a, b} <= set(table.columns) and not value[a] > value[b]]
     return violations
 
 
 def expected_order(objects: bool) -> list[tuple[str, str]]:
-    """Pairs of predictors, the better one first: those of following steps, and of metrics of objects the further pairs.
+    """Pairs of predictors, the better one first: those of following steps, and the further ones.
 
     Of metrics of objects the other robot is left out: it moves them as the first one does.
     """
-    pairs = [(a, b) for better, worse in itertools.pairwise(STEPS) for a in better for b in worse]
-    return [pair for pair in pairs if "other robot" not in pair] + list(FURTHER) if objects else pairs
+    pairs = [(a, b) for better, worse in itertools.pairwise(STEPS) for a in better for b in worse] + list(FURTHER)
+    return [pair for pair in pairs if "other robot" not in pair] + list(OF_OBJECTS) if objects else pairs
 
 
 def to_markdown(table: pd.DataFrame) -> str:

@@ -195,12 +195,27 @@ def test_a_part_of_a_video_is_compared_in_the_whole_videos_box() -> None:
     np.testing.assert_allclose(np.concatenate(parts), region_lpips_frames(prediction, target, mask), atol=1e-7)
 
 
-def test_a_region_without_room_for_the_network_is_an_error() -> None:
-    video, mask = noise(), np.zeros((1, 40, 56), bool)
-    for area in (np.s_[:, :0], np.s_[:, 5:25, 5:50]):
-        mask[area] = True
-        with pytest.raises(ValueError, match="at least 31"):
-            region_lpips(video, video, mask)
+@pytest.mark.parametrize(
+    ("covered", "box"),
+    [
+        (np.s_[15:20, 22:27], (2, 9, 31, 31)),
+        (np.s_[38:40, :3], (9, 0, 31, 31)),
+        (np.s_[:1, 55:], (0, 25, 31, 31)),
+        (np.s_[5:25, 5:50], (0, 5, 31, 45)),
+    ],
+)
+def test_a_small_region_is_grown_about_its_middle_inside_the_image(covered: object, box: tuple[int, ...]) -> None:
+    mask = np.zeros((1, 40, 56), bool)
+    mask[0][covered] = True
+    assert tuple(int(side) for side in union_box(mask)) == box
+    prediction, target = noise(), noise()
+    crop = np.s_[:, box[0] : box[0] + box[2], box[1] : box[1] + box[3]]
+    assert region_lpips(prediction, target, mask) == pytest.approx(float(lpips(prediction[crop], target[crop])[0]), abs=1e-6)
+
+
+def test_a_region_of_nothing_is_an_error() -> None:
+    with pytest.raises(ValueError, match="no pixel"):
+        region_lpips(noise(), noise(), np.zeros((1, 40, 56), bool))
 
 
 def test_receptive_fields_are_those_of_the_network() -> None:

@@ -33,25 +33,21 @@ def brute_diagonal(target: np.ndarray, valid: np.ndarray) -> np.ndarray:
     return np.array([np.linalg.norm(np.ptp(box, axis=0)) if len(box) else 0.0 for box in boxes])
 
 
-def brute_dtw(a: np.ndarray, b: np.ndarray) -> float:
+def brute_dtw(a: np.ndarray, b: np.ndarray, most: float) -> float:
     table = np.full((len(a) + 1, len(b) + 1), np.inf)
     table[0, 0] = 0
     for i in range(len(a)):
         for j in range(len(b)):
             step = min(table[i, j], table[i, j + 1], table[i + 1, j])
-            table[i + 1, j + 1] = np.linalg.norm(a[i] - b[j]) + step
+            table[i + 1, j + 1] = np.fmin(np.linalg.norm(a[i] - b[j]), most) + step
     return table[-1, -1]
 
 
 def brute_ndtw(prediction: np.ndarray, target: np.ndarray, valid: np.ndarray) -> float:
     diagonal = brute_diagonal(target, valid)
-    values = []
-    for i in range(target.shape[1]):
-        keep = valid[:, i] & np.isfinite(prediction[:, i]).all(-1)
-        if keep.any() and diagonal[keep].mean() > 0:
-            cost = brute_dtw(prediction[keep, i], target[keep, i])
-            values.append(cost / (2 * keep.sum() * diagonal[keep].mean()))
-    return float(np.mean(values))
+    scale = diagonal[diagonal > 0].mean() if (diagonal > 0).any() else np.nan
+    paths = [(prediction[keep, i], target[keep, i]) for i, keep in enumerate(valid.T) if keep.any()]
+    return float(np.mean([brute_dtw(*path, scale) / (2 * len(path[0]) * scale) for path in paths]))
 
 
 @pytest.mark.parametrize("t", [1, 2, 9, 30])
@@ -61,6 +57,38 @@ def test_ndtw_equals_the_whole_table(t: int) -> None:
     assert ndtw(prediction, target, valid) == pytest.approx(brute_ndtw(prediction, target, valid), rel=1e-5)
 
 
+def test_a_points_warping_is_bounded_by_the_video_not_by_a_frame_whose_origins_coincide() -> None:
+    """A box of 1e-5 pixels in the only frames of a point made scores of thousands."""
+    _, target, valid = tracks(t=20, k=2)
+    target[:, 1] = target[:, 0] + np.float32(1e-5)
+    valid[:] = True
+    far = target + np.float32([4e3, 0])
+    lost = np.full_like(target, np.nan)
+    for wrong in (far, lost):
+        assert float(ndtw(wrong, target, valid)) == pytest.approx(0.5)
+        assert float(ndtw(wrong, target, valid, np.full(20, 80, np.float32))) == pytest.approx(0.5)
+    assert float(ndtw(target, target, valid, np.full(20, 80, np.float32))) == 0
+    assert np.isnan(ndtw(target, target, valid, np.zeros(20, np.float32)))
+
+
+def test_a_given_diagonal_is_the_scale_of_pck() -> None:
+    _, target, valid = tracks()
+    off, diagonal = target + np.float32([3, 0]), np.linspace(20, 40, len(target)).astype(np.float32)
+    expected = np.repeat((0.1 * diagonal > 3)[:, None], valid.shape[1], axis=1)[valid].mean()
+    assert float(pck(off, target, valid, diagonal=diagonal)) == pytest.approx(expected)
+    assert float(pck_05(off, target, valid, diagonal)) == 0
+
+
+def test_one_wild_point_has_no_more_than_the_images_diagonal() -> None:
+    _, target, valid = tracks(k=1)
+    valid[:] = True
+    wild = target.copy()
+    wild[0] += 1e5
+    for metric in (keypoint_error, trajectory_error):
+        assert float(metric(wild, target, valid)) == pytest.approx(400 / len(target), rel=1e-5)
+        assert float(metric(wild, target, valid, largest=80)) == pytest.approx(80 / len(target), rel=1e-5)
+
+
 @pytest.mark.lab
 def test_ndtw_equals_the_exact_reference_of_fastdtw() -> None:
     import fastdtw
@@ -68,6 +96,7 @@ def test_ndtw_equals_the_exact_reference_of_fastdtw() -> None:
     prediction, target, valid = tracks(40, 3)
     valid[:] = True
     scale = brute_diagonal(target, valid).mean()
+    assert np.linalg.norm(prediction - target, axis=-1).max() < scale, "no step is capped"
     costs = [fastdtw.dtw(prediction[:, i], target[:, i], dist=2)[0] for i in range(3)]
     assert ndtw(prediction, target, valid) == pytest.approx(np.mean(costs) / (80 * scale), rel=1e-5)
 
@@ -127,7 +156,8 @@ def test_a_lost_point_is_a_miss_and_leaves_the_errors_alone() -> None:
     lost = target.copy()
     lost[3, 1] = np.nan
     assert pck(lost, target, valid) == pytest.approx(1 - 1 / valid.size)
-    assert keypoint_error(lost, target, valid) == trajectory_error(lost, target, valid) == ndtw(lost, target, valid) == 0
+    assert keypoint_error(lost, target, valid) == trajectory_error(lost, target, valid) == 0
+    assert float(ndtw(lost, target, valid)) == pytest.approx(brute_ndtw(lost, target, valid)), "one step at the most"
 
 
 def test_invalid_points_may_hold_anything() -> None:

@@ -30,7 +30,11 @@ T_co = TypeVar("T_co", covariant=True)
 
 @runtime_checkable
 class Masker(Protocol):
-    """Robot masks in a predicted video."""
+    """Robot masks in a predicted video.
+
+    The attribute `compares_colors = True` says that the masker compares the two videos: it then gets them in the same exposure
+    and colors (`appearance.match_appearance`). Others get the prediction as it is.
+    """
 
     def __call__(self, prediction: np.ndarray, target: np.ndarray, target_mask: np.ndarray) -> np.ndarray:
         """Masks bool [t h w] of a prediction [t h w 3] uint8, from the true video [t h w 3] uint8 and masks [t h w] bool."""
@@ -41,8 +45,8 @@ class Tracker(Protocol):
     """Positions of the true video's points in a predicted video.
 
     The attribute `pointwise = True` says that each point is found without regard to the others: points of all kinds then come
-    in one
-    call. An optional method `confirm` replaces `presence.confirm_tracks`, with the same arguments.
+    in one call. `compares_colors = True` is as in `Masker`. An optional method `confirm` replaces `presence.confirm_tracks`,
+    with the same arguments.
     """
 
     def __call__(self, prediction: np.ndarray, target: np.ndarray, points: np.ndarray, visible: np.ndarray) -> np.ndarray:
@@ -109,6 +113,8 @@ def _open(backend: Backend[T], name: str, checkpoint: Path | None, option: str) 
 
 class ReferenceMasker:
     """`estimate_masks`, which keeps an episode while predictions of the same episode follow each other."""
+
+    compares_colors = True
 
     def __init__(self) -> None:
         self._episode: Episode | None = None

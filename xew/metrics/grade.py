@@ -11,11 +11,14 @@ from functools import cached_property
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from xew.metrics import METRICS
 from xew.metrics.backends import Masker, Tracker
 from xew.metrics.episode_cache import EpisodeCache, GradedVideo, cut_blocks, fill_up, is_on_cpu
+from xew.metrics.estimators.appearance import REST as SCENE
+from xew.metrics.estimators.appearance import match_appearance
 from xew.metrics.estimators.presence import confirm_tracks
 from xew.metrics.perceptual import SMALLEST_SIDE, Box, lpips, region_lpips_frames, robot_lpips_frames, union_box
 from xew.metrics.truth import Points, Truth
@@ -73,10 +76,19 @@ class Comparison:
         """The graded frames of the prediction."""
         return GradedVideo(self.prediction[self.episode.first :])
 
-    @property
-    def side(self) -> float:
-        """Square root of the image's area [pixels]."""
-        return math.sqrt(self.prediction.shape[1] * self.prediction.shape[2])
+    def track_options(self, kind: str) -> dict[str, np.ndarray]:
+        """The values of `metric.OPTIONS`, scalars, [t] and [k], for points of a kind, filled up as their tracks are."""
+        height, width = self.prediction.shape[1:3]
+        first, points = self.episode.first, self.points[kind]
+        seen = points.visible[first:].any(axis=0)
+        numbers = {name: _numbers(points, name)[seen] for name in ("body", "finger")}
+        return {
+            "side": np.asarray(math.sqrt(height * width), np.float32),
+            "largest": np.asarray(math.hypot(height, width), np.float32),
+            "diagonal": fill_up(self.truth.keypoint_diagonal[first:], 0, TRACK_BLOCK, 0),
+            "frames": np.asarray(len(self.prediction) - first, np.int32),
+            **{name: fill_up(values, 0, POINT_BLOCK, -1) for name, values in numbers.items()},
+        }
 
     @cached_property
     def points(self) -> dict[str, Points]:
@@ -92,7 +104,7 @@ class Comparison:
 
     def estimate_masks(self) -> np.ndarray:
         """Robot masks [t h w] bool of all frames of the prediction."""
-        return self.masker(self._estimator_input, self.truth.rgb, self.truth.mask)
+        return self.masker(*self._videos_for(self.masker), self.truth.mask)
 
     def track(self, kind: str) -> np.ndarray:
         """Tracks of the points of a kind [t k 2] pixels, NaN where lost or hidden in the truth.
@@ -110,29 +122,38 @@ class Comparison:
     def _estimator_input(self) -> np.ndarray:
         return self.prediction if self.estimator_video is None else self.estimator_video
 
+    @cached_property
+    def _alike(self) -> tuple[np.ndarray, np.ndarray]:
+        """The predicted and the true video in the same colors."""
+        return match_appearance(self._estimator_input, self.truth.rgb, self.truth.labels)
+
+    def _videos_for(self, estimator: object) -> tuple[np.ndarray, np.ndarray]:
+        """The predicted and the true video as an estimator takes them."""
+        return self._alike if getattr(estimator, "compares_colors", False) else (self._estimator_input, self.truth.rgb)
+
     def _track(self, kinds: tuple[str, ...]) -> dict[str, np.ndarray]:
         """Tracks [t k 2] by kind, found in one call; places without the color of the point's body are dropped."""
         points = [self.points[kind] for kind in kinds]
         pixels, visible = (np.concatenate([getattr(some, name) for some in points], axis=1) for name in ("pixels", "visible"))
         seen = visible.any(axis=0)
         tracks = np.full(pixels.shape, np.nan, np.float32)
-        videos = self._estimator_input, self.truth.rgb
         if seen.any():
-            tracks[:, seen] = self.tracker(*videos, np.nan_to_num(pixels[:, seen]), visible[:, seen])
+            tracks[:, seen] = self.tracker(*self._videos_for(self.tracker), np.nan_to_num(pixels[:, seen]), visible[:, seen])
         if self.truth.surfaces is not None and self.truth.surfaces.body_id is not None:
-            body = np.concatenate([_bodies(some) for some in points])
+            body = np.concatenate([_numbers(some, "body") for some in points])
             on_body = seen & (body >= 0)
             places = np.nan_to_num(pixels[:, on_body]), visible[:, on_body]
             confirm = getattr(self.tracker, "confirm", confirm_tracks)
             body_id = self.truth.surfaces.body_id
-            tracks[:, on_body] = confirm(tracks[:, on_body], *videos, *places, body_id, body[on_body])
+            tracks[:, on_body] = confirm(tracks[:, on_body], *self._alike, *places, body_id, body[on_body])
         ends = np.cumsum([some.visible.shape[1] for some in points])
         return dict(zip(kinds, np.split(tracks, ends[:-1], axis=1), strict=True))
 
 
-def _bodies(points: Points) -> np.ndarray:
-    """[k] int32, the body that each point lies on, -1 where that is not known."""
-    return np.full(points.visible.shape[1], -1, np.int32) if points.body is None else points.body
+def _numbers(points: Points, name: str) -> np.ndarray:
+    """[k] int32, the body or finger that each point lies on, -1 where that is not known."""
+    numbers = getattr(points, name)
+    return np.full(points.visible.shape[1], -1, np.int32) if numbers is None else numbers.astype(np.int32)
 
 
 def grade(comparison: Comparison, metrics: Collection[str]) -> Grades:
@@ -169,21 +190,29 @@ def _mask(c: Comparison) -> Arrays:
 
 
 def _region(c: Comparison) -> Arrays | None:
-    """The two videos and, for each frame, all pixels that show the robot at any time; None where its box is too small."""
+    """The two videos and, for each frame, all pixels that show the robot at any time; None where no frame shows it."""
     mask = c.truth.mask[c.episode.first :]
     covered = np.any(mask, axis=0)
-    _, _, height, width = union_box(np.expand_dims(covered, 0))
-    if min(int(height), int(width)) < SMALLEST_SIDE:
+    if not covered.any() or min(covered.shape) < SMALLEST_SIDE:
         return None
     return *_video(c), np.broadcast_to(covered, mask.shape)
 
 
 def _robot(c: Comparison) -> Arrays | None:
-    """The two videos and the robot's true masks, frame by frame; None where no frame shows the robot."""
-    mask = c.truth.mask[c.episode.first :]
-    if not mask.any() or min(mask.shape[1:]) < SMALLEST_SIDE:
+    """The two videos and the robot's true masks, frame by frame; None where no frame shows the robot.
+
+    A frame without the robot gets all pixels that show it at any time, so a robot that is still shown there is an error.
+    """
+    region = _region(c)
+    if region is None:
         return None
-    return *_video(c), mask
+    mask = c.truth.mask[c.episode.first :]
+    return *region[:2], np.where(mask.any(axis=(1, 2), keepdims=True), mask, region[2])
+
+
+def _bodies(c: Comparison) -> Arrays:
+    """The two videos and the true masks of the robot and of all objects, frame by frame."""
+    return *_video(c), c.truth.labels[c.episode.first :] != SCENE
 
 
 def _tracks(kind: str, c: Comparison) -> Arrays | None:
@@ -199,6 +228,7 @@ INPUTS: dict[str, Callable[[Comparison], Arrays | None]] = {
     "mask": _mask,
     "region": _region,
     "robot": _robot,
+    "bodies": _bodies,
     **{kind: functools.partial(_tracks, kind) for kind in ("keypoints", "objects", *ON_SURFACES)},
 }
 """Arrays that the functions of metrics take, by `input_kind`; None where the truth has nothing to compare."""
@@ -263,9 +293,10 @@ def _grade_tracks(
     for kind in dict.fromkeys(kinds.values()):
         names, arrays = tuple(name for name in kinds if kinds[name] == kind), inputs[kind]
         if arrays is not None:
+            options = comparison.track_options(kind)
             padded = [fill_up(fill_up(array, 0, TRACK_BLOCK, 0), 1, POINT_BLOCK, 0) for array in arrays]
             with jax.default_device(jax.local_devices(backend="cpu")[0]):
-                values, curves = jax.device_get(_compare_tracks(names, padded, np.float32(comparison.side)))
+                values, curves = jax.device_get(_compare_tracks(names, padded, options))
             count = len(arrays[0])
             scores |= {name: (float(values[name]), curves[name][:count] if name in curves else None) for name in names}
     return scores
@@ -273,14 +304,25 @@ def _grade_tracks(
 
 @functools.partial(jax.jit, static_argnums=0)
 def _compare_tracks(
-    names: tuple[str, ...], arrays: list[jax.Array], side: jax.Array
+    names: tuple[str, ...], arrays: list[jax.Array], options: dict[str, jax.Array]
 ) -> tuple[dict[str, jax.Array], dict[str, jax.Array]]:
     """Metrics of tracks by name, as one program: scalars, and [t] of each frame alone, NaN where it has nothing to compare."""
-    chosen = {name: METRICS[name] for name in names}
-    functions = {name: functools.partial(m.function, side=side) if m.by_image else m.function for name, m in chosen.items()}
-    values = {name: function(*arrays) for name, function in functions.items()}
+    values = {name: _score(name, arrays, options) for name in names}
     frames = [array[:, None] for array in arrays]
-    return values, {name: jax.vmap(functions[name])(*frames) for name, m in chosen.items() if not m.whole}
+    of_frames = options | {"diagonal": options["diagonal"][:, None], "frames": jnp.int32(1)}
+    axes = {name: 0 if name == "diagonal" else None for name in of_frames}
+    curves = {
+        name: jax.vmap(functools.partial(_score, name), in_axes=(0, axes))(frames, of_frames)
+        for name in names
+        if not METRICS[name].whole
+    }
+    return values, curves
+
+
+def _score(name: str, arrays: list[jax.Array], options: dict[str, jax.Array]) -> jax.Array:
+    """The scalar of a metric of tracks, with those of the options that its function takes."""
+    metric = METRICS[name]
+    return metric.function(*arrays, **{option: options[option] for option in metric.options})
 
 
 def _mean_of_known(curve: np.ndarray) -> float:

@@ -24,9 +24,9 @@ SSIM_C1, SSIM_C2 = (0.01 * 255) ** 2, (0.03 * 255) ** 2
 def psnr(prediction: Video, target: Video, *, chunk: int | None = None) -> ByFrame:
     """Peak signal-to-noise ratio of each frame [dB], higher is better.
 
-    Exact frames have no finite PSNR. As in the paper they are capped at the largest finite value among the frames of the same
-    call. If all frames are exact, the cap is the PSNR of one channel of one pixel off by one level (101.76 dB at 320x240).
-    Report the mean with the count of `exact_frames`, because a cap can move it.
+    Exact frames have no finite PSNR. They are capped at the most that an inexact frame can attain, one channel of one pixel
+    off by one level (101.76 dB at 320x240), so a frame's value does not depend on other frames. Report the mean with the count
+    of `exact_frames`, because a cap can move it.
 
     Args:
         prediction, target: [t h w 3] uint8, or floating in [0, 1].
@@ -36,11 +36,8 @@ def psnr(prediction: Video, target: Video, *, chunk: int | None = None) -> ByFra
         [t] float32; NaN where a pixel of either frame is NaN.
     """
     error = mean_squared_error(prediction, target, chunk)
-    finite = -10 * jnp.log10(jnp.where(error == 0, 1, error) / 255**2)
-    largest = jnp.max(jnp.where(error > 0, finite, -jnp.inf))
     attainable = 10 * jnp.log10(jnp.float32(255**2 * math.prod(np.shape(target)[1:])))
-    cap = jnp.where(jnp.isfinite(largest), largest, attainable)
-    return jnp.where(error == 0, cap, finite)
+    return jnp.where(error == 0, attainable, -10 * jnp.log10(jnp.where(error == 0, 1, error) / 255**2))
 
 
 @check_first(check_videos)

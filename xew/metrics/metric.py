@@ -14,9 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Bool, Float, Float32, UInt8
-
-from xew.metrics.total import Total, total_of
+from jaxtyping import Bool, Float, Float32, Int32, UInt8
 
 AnyArray: TypeAlias = jax.Array | np.ndarray
 Video: TypeAlias = UInt8[AnyArray, "t h w 3"] | Float[AnyArray, "t h w 3"]
@@ -34,9 +32,10 @@ Scalar: TypeAlias = Float32[jax.Array, ""]
 P = ParamSpec("P")
 R = TypeVar("R")
 
-INPUTS = ("video", "mask", "region", "robot", "track")
+INPUTS = ("video", "mask", "region", "robot", "bodies", "track")
 """Kinds of what a metric compares. video: two [t h w 3]. mask: two [t h w]. region: two videos and the union over time of the
-target's masks. robot: two videos and the target's masks frame by frame. track: two [t k 2], valid [t k]."""
+target's masks. robot: two videos and the target's masks frame by frame. bodies: the same with masks of the robot and all
+objects. track: two [t k 2], valid [t k]."""
 ESTIMATED_INPUTS = ("mask", "track")
 """Inputs that have to be estimated in a prediction."""
 SUITES = {
@@ -47,11 +46,45 @@ SUITES = {
 POINTS = ("origins", "surfaces")
 """Kinds of points that tracks follow: origins of links and objects, or points on surfaces of links and of what moves."""
 
+OPTIONS = {
+    "side": "square root of the image's area [pixels]",
+    "largest": "the image's diagonal [pixels]",
+    "diagonal": "[t] diagonal [pixels] of the box of all link origins inside the image, occluded or not",
+    "frames": "number of frames",
+    "body": "[k] number of the body that each point lies on, -1 where that is not known",
+    "finger": "[k] number of the finger that each point lies on, 0 and 1 of the left hand, 2 and 3 of the right, else -1",
+}
+"""Options of metrics of tracks that grading supplies, with what each holds."""
+
 OVERSHOOT = 0.25
 """Amount by which floats may lie outside of [0, 1]: more than a decoder's overshoot, less than what [-1, 1] shows."""
 ACCELERATOR_CHUNK = 64
 """Number of frames computed at once on a GPU or TPU; one is fastest on a CPU, where a frame's intermediates then stay in its
 cache."""
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Total:
+    """Sum and number of values. The sum of two totals is the total of the values of both."""
+
+    total: Float32[jax.Array, ""]
+    """Sum of the values that count; not finite where one of them is not."""
+    count: Int32[jax.Array, ""]
+
+    @property
+    def mean(self) -> Float32[jax.Array, ""]:
+        """Mean [()] of the values that count; NaN where there is none."""
+        return self.total / self.count.astype(jnp.float32)
+
+    def __add__(self, other: "Total") -> "Total":
+        return Total(self.total + other.total, self.count + other.count)
+
+
+def total_of(values: Float32[jax.Array, "..."], counts: Bool[jax.Array, "..."] | None = None) -> Total:
+    """Total of values [...] float32: of those where `counts` [...] bool, or of all."""
+    counts = jnp.ones(values.shape, bool) if counts is None else counts
+    return Total(jnp.sum(jnp.where(counts, values, 0), dtype=jnp.float32), jnp.sum(counts, dtype=jnp.int32))
 
 
 @dataclass(frozen=True)
@@ -78,8 +111,8 @@ class Metric:
     reported: bool = True
     """Whether a study's full tables show it; False for companions of other metrics."""
     whole: bool = False
-    """Whether its values by frame need the whole video, so frames are never graded in blocks (PSNR, by its cap); of a
-    metric of tracks, whether a frame has no value of its own (nDTW)."""
+    """Whether its values by frame need the whole video, so frames are never graded in blocks (flicker); of a metric of tracks,
+    whether a frame has no value of its own (nDTW)."""
     parts: Callable[..., tuple[jax.Array, jax.Array]] | None = None
     """Function of the same inputs to the values that the metric is the mean of, and which of them count; None where these are
     the values by frame, or where it is a mean of means (`trajectory_error`)."""
@@ -88,8 +121,8 @@ class Metric:
     """Name of the metric of the suite paper in whose place it stands in the suite strict, and decides."""
     points: str = "origins"
     """Points that a metric of tracks compares, one of `POINTS`."""
-    by_image: bool = False
-    """Whether its functions take the option `side`, the square root of the image's area [pixels]."""
+    options: tuple[str, ...] = ()
+    """Names of options of its functions that grading supplies to a metric of tracks, keys of `OPTIONS`."""
 
     @property
     def estimated(self) -> bool:
@@ -110,8 +143,7 @@ class Metric:
         """Sum and number of the values that the metric averages; totals of parts of a video, or of several videos, add up.
 
         Args:
-            inputs, options: of `function`, for all frames or some. Paths cannot be cut (nDTW); PSNR caps exact frames by the
-                given ones.
+            inputs, options: of `function`, for all frames or some. Paths cannot be cut (nDTW).
 
         Raises:
             ValueError: the metric is no mean over frames or points.
@@ -172,6 +204,15 @@ def check_videos(prediction: Any, target: Any, smallest_side: int = 1) -> None:
         raise TypeError(f"videos have dtype {' and '.join(dtypes)}, expected both uint8, or both floating in [0, 1].")
     for name, video in (("prediction", prediction), ("target", target)):
         _check_range(name, video)
+
+
+def check_masked_videos(prediction: Any, target: Any, target_mask: Any, smallest_side: int = 1) -> None:
+    """Raise ValueError or TypeError unless videos are as in `check_videos` and masks bool [t h w] with them."""
+    check_videos(prediction, target, smallest_side)
+    check_arrays(target_mask=target_mask)
+    if np.shape(target_mask) != np.shape(target)[:3]:
+        raise ValueError(f"target_mask is {np.shape(target_mask)}, expected {np.shape(target)[:3]}, as the video's [t h w].")
+    check_bool("target_mask", target_mask)
 
 
 def _remedy_of_shape(shape: tuple[int, ...]) -> str:

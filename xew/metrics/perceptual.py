@@ -20,9 +20,8 @@ from xew.metrics.metric import (
     Masks,
     Scalar,
     Video,
-    check_arrays,
-    check_bool,
     check_first,
+    check_masked_videos,
     check_videos,
     map_chunks,
 )
@@ -75,8 +74,7 @@ def lpips(prediction: Video, target: Video, *, chunk: int | None = None, exact: 
 
 def check_region(prediction: Any, target: Any, target_mask: Any) -> None:
     """Raise ValueError or TypeError unless videos are [t h w 3], alike and large enough, and masks bool [t h w] with them."""
-    check_videos(prediction, target, SMALLEST_SIDE)
-    _check_mask(target, target_mask)
+    check_masked_videos(prediction, target, target_mask, SMALLEST_SIDE)
 
 
 @check_first(check_region)
@@ -85,8 +83,8 @@ def region_lpips(
 ) -> Scalar:
     """LPIPS inside the bounding box of the union over time of the target's robot masks, mean over frames.
 
-    The box is one for the whole video and is cut out before the network. Under a caller's jit a box too small gives NaN, no
-    error.
+    The box is one for the whole video and is cut out before the network. A side under 31 pixels is grown to 31, since the
+    network needs as many. Under a caller's jit masks without a pixel give NaN, no error.
 
     Args:
         prediction, target: [t h w 3] RGB, uint8, or floating in [0, 1].
@@ -98,7 +96,7 @@ def region_lpips(
         Scalar float32, lower is better.
 
     Raises:
-        ValueError: shapes differ, no pixel is masked, or the box has a side under 31 pixels.
+        ValueError: shapes differ, no pixel is masked, or a side of the frames is under 31 pixels.
     """
     return jnp.mean(region_lpips_frames(prediction, target, target_mask, box=box, chunk=chunk))
 
@@ -269,14 +267,24 @@ def _weighted_distance_of_layers(weights: Weights, prediction: Layers, target: L
 
 @jax.jit
 def union_box(mask: Masks) -> Box:
-    """Bounding box (top, left, height, width) int32 [pixels] of all that [t h w] covers at any time; zeros if nothing."""
+    """Bounding box (top, left, height, width) int32 [pixels] of all that [t h w] covers at any time; zeros if nothing.
+
+    Sides under SMALLEST_SIDE are grown about their middle, as far as the image allows.
+    """
     covered = jnp.any(mask, axis=0)
-    rows, columns = jnp.any(covered, axis=1), jnp.any(covered, axis=0)
-    top, left = jnp.argmax(rows), jnp.argmax(columns)
-    height = jnp.where(jnp.any(rows), len(rows) - jnp.argmax(rows[::-1]) - top, 0)
-    width = jnp.where(jnp.any(columns), len(columns) - jnp.argmax(columns[::-1]) - left, 0)
+    top, height = _extent(jnp.any(covered, axis=1))
+    left, width = _extent(jnp.any(covered, axis=0))
+    return top, left, height, width
+
+
+def _extent(covered: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """First pixel and length, int32, of what is covered of a side [n], grown to SMALLEST_SIDE; zeros if nothing."""
+    first, after = jnp.argmax(covered), len(covered) - jnp.argmax(covered[::-1])
+    side = jnp.minimum(jnp.maximum(after - first, SMALLEST_SIDE), len(covered))
+    first = jnp.clip(first - (side - after + first) // 2, 0, len(covered) - side)
     # In 64 bits argmax is of another type than the sizes of frames.
-    return top.astype(jnp.int32), left.astype(jnp.int32), height.astype(jnp.int32), width.astype(jnp.int32)
+    first, side = (jnp.where(jnp.any(covered), value, 0).astype(jnp.int32) for value in (first, side))
+    return first, side
 
 
 def _whole_box(video: AnyArray) -> Box:
@@ -284,23 +292,11 @@ def _whole_box(video: AnyArray) -> Box:
     return jnp.int32(0), jnp.int32(0), jnp.int32(height), jnp.int32(width)
 
 
-def _check_mask(target: Any, target_mask: Any) -> None:
-    check_arrays(target_mask=target_mask)
-    if np.shape(target_mask) != np.shape(target)[:3]:
-        raise ValueError(f"target_mask is {np.shape(target_mask)}, expected {np.shape(target)[:3]}, as the video's [t h w].")
-    check_bool("target_mask", target_mask)
-
-
 def _mask_box(target_mask: AnyArray) -> Box:
-    """The box of the masks. Raises ValueError where it is too small, unless its size is not known yet, under a jit."""
+    """The box of the masks. Raises ValueError if they are empty, unless that is not known yet, under a jit."""
     box = union_box(target_mask)
-    if not isinstance(box[2], jax.core.Tracer):
-        height, width = int(box[2]), int(box[3])
-        if min(height, width) < SMALLEST_SIDE:
-            raise ValueError(
-                f"the robot's box is {height} x {width} pixels; region LPIPS needs sides of at least {SMALLEST_SIDE}. "
-                "Check that the masks belong to this video."
-            )
+    if not isinstance(box[2], jax.core.Tracer) and not int(box[2]):
+        raise ValueError("target_mask has no pixel, so region LPIPS has no box; check that the masks belong to this video.")
     return box
 
 

@@ -5,23 +5,29 @@ Reads  <data>/<task>/<seed>/<robot>/ (xew.episode)
 
 from collections.abc import Collection
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
 from xew.episode import EpisodeError, Record, demand_known, project, read_pixels, read_record, read_states
+from xew.metrics.estimators.appearance import REST as SCENE
 
 NEEDS = {
     "video": (),
     "mask": ("robot_mask",),
     "region": ("robot_mask",),
     "robot": ("robot_mask",),
+    "bodies": ("robot_mask",),
     "keypoints": ("keypoints", "keypoint_visible"),
     "objects": ("object_pose", "extrinsics", "intrinsics"),
     "robot_points": ("keypoints", "keypoint_visible"),
     "object_points": ("object_pose", "extrinsics", "intrinsics"),
 }
 """Arrays of an episode that each kind of comparison rests on; imported episodes may not know some."""
+
+WITH_SURFACES = frozenset(NEEDS) - {"video", "region", "robot"}
+"""Kinds of comparison that look for bodies, which surfaces tell apart."""
 
 REST = 1.0
 """Largest distance [pixels] by which a resting object's point may move."""
@@ -44,6 +50,8 @@ class Points:
     """[t k] bool."""
     body: np.ndarray | None = None
     """[k] int, index of the body that each point lies on, as in `Surfaces.body_id`; None where bodies are not known."""
+    finger: np.ndarray | None = None
+    """[k] int, the finger of each point: 0 and 1 of the left hand, 2 and 3 of the right, else -1; None if not known."""
 
 
 @dataclass(frozen=True)
@@ -79,6 +87,22 @@ class Truth:
     surfaces: Surfaces | None = None
     """Points on surfaces; None where they were not asked for."""
 
+    @cached_property
+    def labels(self) -> np.ndarray:
+        """[t h w] int16, 0 for the robot, numbers from 1 for objects of known shapes, SCENE for the rest."""
+        labels = np.where(self.mask, 0, SCENE).astype(np.int16)
+        if self.surfaces is None or self.surfaces.body_id is None:
+            return labels
+        return np.where(~self.mask & (self.surfaces.body_id >= 0), self.surfaces.body_id + 1, labels).astype(np.int16)
+
+    @cached_property
+    def keypoint_diagonal(self) -> np.ndarray:
+        """[t] float32, diagonal [pixels] of the box of all keypoints inside the image, occluded or not; 0 without any."""
+        inside = is_inside(self.keypoints, self.rgb.shape)[..., None]
+        low = np.where(inside, self.keypoints, np.inf).min(axis=1, initial=np.inf)
+        high = np.where(inside, self.keypoints, -np.inf).max(axis=1, initial=-np.inf)
+        return np.linalg.norm(np.where(inside.any(axis=1), high - low, 0), axis=-1).astype(np.float32)
+
 
 def read_truth(
     folder: Path, frames: int, compared: Collection[str], cache: Path | None = None, record: Record | None = None
@@ -104,7 +128,7 @@ def read_truth(
     objects = project(states.object_pose[..., :3], states.intrinsics, states.extrinsics)[0].astype(np.float32)
     visible = _find_visible(objects, rgb, states.robot_mask)
     surfaces = None
-    if {"robot_points", "object_points"} & set(compared):
+    if WITH_SURFACES & set(compared):
         surfaces = _find_surfaces(folder, frames, cache) or Surfaces(
             Points(states.keypoints[:frames], states.keypoint_visible[:frames]),
             _of_moving(states.object_pose[..., :3], Points(objects, visible), frames),
@@ -124,15 +148,16 @@ def read_truth(
 
 def _find_surfaces(folder: Path, frames: int, cache: Path | None) -> Surfaces | None:
     # Only here: the metrics load without Warp.
-    from xew.sim_warp.production.surfaces import read_surfaces
+    from xew.sim_warp.production.surfaces import find_fingers, read_surfaces
 
     tracks = read_surfaces(folder, keep=cache)
     if tracks is None:
         return None
+    finger = find_fingers(folder, tracks.names)
     of_robot = tracks.is_robot[tracks.body]
     moves = (tracks.displacement[:frames].max(axis=0) > MOVED)[tracks.body]
     robot, objects = (
-        Points(tracks.pixels[:frames, some], tracks.visible[:frames, some], tracks.body[some])
+        Points(tracks.pixels[:frames, some], tracks.visible[:frames, some], tracks.body[some], finger[tracks.body[some]])
         for some in (of_robot, ~of_robot & moves)
     )
     return Surfaces(robot, objects, tracks.shown[:frames], known=True)

@@ -21,12 +21,14 @@ from lab.calibration.calibrate import (
     true_grades,
 )
 from lab.calibration.perturbations import MOTIONS, Perturbation, render_perturbations
+from lab.calibration.predictors import APPEARANCES
 from tests.sim_warp.small import TASK
 from tests.synthetic import write_synthetic_data
 from xew.config import ConfigError
 from xew.dataset import find_accepted
 from xew.episode import Record, read_record, read_states, read_video
 from xew.metrics import METRICS
+from xew.metrics.grading.codecs import ModelCodec
 from xew.metrics.truth import NEEDS, read_truth
 
 
@@ -113,12 +115,22 @@ def test_true_grades_take_the_known_truth_and_not_an_estimate(data: Path) -> Non
     assert values["trajectory_error"] == pytest.approx(4, rel=1e-5)
 
 
+class Inverse:
+    """A codec of a model that is given the render of its robot."""
+
+    model, digest, sees_render = "inverse", "inverse", True
+
+    def __call__(self, video: np.ndarray, render: np.ndarray | None = None) -> np.ndarray:
+        assert render is not None and render.shape == video.shape
+        return 255 - video
+
+
 def test_references_are_what_they_are_called(data: Path) -> None:
     episodes = find_accepted(data)
     folder, record = episodes[0]
     truth = read_truth(folder, record.frame_count, NEEDS)
-    videos = dict(reference_videos(episodes, record, truth, through_codec=lambda video: 255 - video))
-    assert [len(video) for video in videos.values()] == [len(truth.rgb)] * 6
+    videos = dict(reference_videos(episodes, episodes[0], truth, ModelCodec(Inverse(), "inverse")))
+    assert set(APPEARANCES) <= set(videos) and {len(video) for video in videos.values()} == {len(truth.rgb)}
     np.testing.assert_array_equal(videos["truth through the codec"], 255 - truth.rgb)
     np.testing.assert_array_equal(videos["frozen first frame"], np.repeat(truth.rgb[:1], len(truth.rgb), axis=0))
     others = {name: read_record(find_another(episodes, record, name.split()[1])) for name in ("another robot", "another seed")}

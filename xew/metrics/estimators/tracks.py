@@ -90,6 +90,7 @@ class ReferenceTracker:
     """`estimate_tracks`, which keeps what it derives from two videos while the same arrays follow each other."""
 
     pointwise = True
+    compares_colors = True
 
     def __init__(self) -> None:
         self._seen: _Video | None = None

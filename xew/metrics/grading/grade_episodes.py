@@ -15,7 +15,7 @@ from tqdm import tqdm
 from xew.episode import EpisodeError, read_record
 from xew.metrics.backends import Masker, Tracker
 from xew.metrics.episode_cache import EpisodeCache
-from xew.metrics.grade import Comparison, Grades, grade, input_kind
+from xew.metrics.grade import ON_SURFACES, Comparison, Grades, grade, input_kind
 from xew.metrics.grading.baselines import BASELINES
 from xew.metrics.grading.codecs import ModelCodec
 from xew.metrics.grading.list_jobs import Job
@@ -88,7 +88,8 @@ class Grader:
                     raise RolloutError(message) from error
                 errors.append(message)
         surfaces = episode.truth.surfaces if episode else None
-        return GroupResult(errors, notes, has_shapes=surfaces is None or surfaces.known)
+        on_surfaces = any(input_kind(name) in ON_SURFACES for _, names in group for name in names)
+        return GroupResult(errors, notes, has_shapes=not on_surfaces or surfaces is None or surfaces.known)
 
     def read_episode(self, group: Group) -> EpisodeCache:
         """The episode of a group's jobs, as far as their metrics need it. Raises EpisodeError as `read_truth`."""

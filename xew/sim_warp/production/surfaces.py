@@ -13,8 +13,10 @@ import numpy as np
 from xew.config import ConfigError, UntrustedError
 from xew.episode import Record, States, data_folder, read_record, read_states
 from xew.sim_warp.embodiment.spec import RobotSpec
+from xew.sim_warp.embodiment.urdf import load_urdf
 from xew.sim_warp.geometry.camera import Camera
 from xew.sim_warp.production.kept_tracks import load_tracks, save_tracks, tracks_key, tracks_path
+from xew.sim_warp.rendering.bodies import SIDES
 from xew.sim_warp.rendering.observe import scene_recording
 from xew.sim_warp.rendering.streams import default_renderer
 from xew.sim_warp.rendering.surfaces import MOVED, MOVING, SurfaceTracks, track_surfaces
@@ -78,6 +80,26 @@ def read_surfaces(folder: Path, keep: Path | None = None) -> SurfaceTracks | Non
         tracks = _render_surfaces(robot, scene, states)
         save_tracks(path, key, tracks)
     return tracks
+
+
+def find_fingers(folder: Path, names: Sequence[str]) -> np.ndarray:
+    """The finger that each body of an episode's surface tracks belongs to.
+
+    Args:
+        folder: of an episode whose robot is known.
+        names: of the bodies, as `SurfaceTracks.names`.
+
+    Returns:
+        [b] int: 0 and 1 for the fingers of the left hand, 2 and 3 for those of the right, -1 for all others.
+    """
+    robot = recorded_robot(read_record(folder).robot, data_folder(folder))
+    urdf = load_urdf(robot.urdf)
+    fingers: dict[str, int] = {}
+    for side, (name, arm) in enumerate(zip(SIDES, robot.arms, strict=True)):
+        for index, joint in enumerate(arm.fingers):
+            links = [link.name for link in urdf.moved_links(joint)]
+            fingers |= {link if robot.one_urdf_holds_both_arms else f"{name}/{link}": 2 * side + index for link in links}
+    return np.array([fingers.get(name, -1) for name in names])
 
 
 def _render_surfaces(robot: RobotSpec, scene: Scene, states: States) -> SurfaceTracks:

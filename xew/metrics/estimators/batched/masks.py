@@ -21,6 +21,8 @@ FRAMES_AT_ONCE = {"cpu": 8, "cuda": 128}
 class BatchedMasker:
     """`estimate_masks` on a device (Warp's name, None for the default), which keeps an episode while it repeats."""
 
+    compares_colors = True
+
     def __init__(self, device: str | None = None) -> None:
         self._device = wp.get_device(device)
         self._known: _Episode | None = None

@@ -36,6 +36,7 @@ class BatchedTracker:
     """`estimate_tracks` on a device (Warp's name, None for the default), which keeps two videos while they repeat."""
 
     pointwise = True
+    compares_colors = True
 
     def __init__(self, device: str | None = None) -> None:
         self._device = wp.get_device(device)
