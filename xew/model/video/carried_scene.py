@@ -130,11 +130,13 @@ def take(shown: Video, canvas: Image, unseen: Mask, pose: Pose, view: View, grou
     What was hidden of it is added, also to the scenes shown before.
     """
     (point,), depth = view.project(pose[None, :3, 3])
+    if not depth > 0:
+        return None
     scale = view.intrinsics[0, 0] / depth
-    box = surround(point, point, REACH * scale) if depth > 0 else (slice(0), slice(0))
-    part, hidden = canvas[box], unseen[box]
-    origin = np.array([box[1].start, box[0].start])
-    if not part.size or (mask := find_object(part, hidden, point - origin, NEAR * scale, REACH * scale, ground)) is None:
+    box = surround(point, point, REACH * scale)
+    part, hidden, origin = canvas[box], unseen[box], np.array([box[1].start, box[0].start])
+    mask = find_object(part, hidden, point - origin, NEAR * scale, REACH * scale, ground) if part.size else None
+    if mask is None:
         return None
     added = complete(part, hidden, mask, point - origin)
     for scene in shown[(slice(None), *box)]:
