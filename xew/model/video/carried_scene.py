@@ -125,9 +125,9 @@ def find_grasps(gripper: np.ndarray) -> np.ndarray:
 
 
 def take(shown: Video, canvas: Image, unseen: Mask, pose: Pose, view: View, ground: np.ndarray) -> Sprite | None:
-    """Cut the object at a hand out of the canvas, which is filled; None if there is none.
+    """Cut the object at a hand out of the canvas [h w 3], which is filled with the ground [3]; None if there is none.
 
-    What was hidden of it is added, also to the scenes shown before.
+    What was hidden of it is added, also to the scenes [t h w 3] shown before.
     """
     (point,), depth = view.project(pose[None, :3, 3])
     if not depth > 0:

@@ -14,7 +14,7 @@ of the channels. On validation scenes 99.9 % of the table lie above the second l
 LEAST_PIXELS = 25
 """Number of pixels of the smallest object."""
 HIDDEN = 2.5
-"""Factor of the distance to an object where its place was not seen."""
+"""Factor of the distance to an object where its place was not seen, behind the robot or out of view."""
 CLOSING = 5
 """Diameter [pixels] of the disk that closes gaps of an object, and grows it before its place is filled."""
 BLUR = 10.0
@@ -31,8 +31,7 @@ def find_object(canvas: Image, unseen: Mask, point: np.ndarray, near: float, rea
     rows, columns = np.ogrid[: canvas.shape[0], : canvas.shape[1]]
     distance = np.hypot(rows - point[1], columns - point[0])
     allowed = (unseen == 0) & (distance <= reach)
-    x, y = np.clip(np.rint(point), 0, np.array(canvas.shape[1::-1]) - 1).astype(int)
-    touched = distance <= near * (HIDDEN if unseen[y, x] else 1)
+    touched = distance <= near * (1 if (distance[unseen == 0] < 1).any() else HIDDEN)
     parts = [find_part(differ(canvas, ground, shadow) & allowed, touched) for shadow in SHADOWS]
     objects = [part for part in parts if part is not None and cv2.countNonZero(part) >= LEAST_PIXELS]
     return max(objects, key=lambda mask: cv2.countNonZero(mask) / cv2.countNonZero(hull(mask)), default=None)
@@ -100,7 +99,7 @@ def fill(image: Image, hole: Mask, ground: np.ndarray) -> None:
 
 
 def surround(low: np.ndarray, high: np.ndarray, margin: float) -> tuple[slice, slice]:
-    """The rows and columns of an image from a pixel x y to another one, and a margin around them."""
+    """The rows and columns of an image from a pixel x y [2] to another one, and a margin [pixels] around them."""
     left, top = (max(int(value - margin), 0) for value in low)
     right, bottom = (max(int(value + margin) + 1, 0) for value in high)
     return slice(top, bottom), slice(left, right)
