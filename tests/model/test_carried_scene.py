@@ -10,6 +10,7 @@ from xew.episode import read_record, read_states
 from xew.metrics.grading import baselines
 from xew.model.conditions import carried_render, make_command, pasted_render
 from xew.model.video.carried_scene import WHITE, View, carry, find_grasps
+from xew.model.video.ground import SPREAD
 from xew.sim_warp.geometry.camera import HEAD_CAMERA, project
 
 VIEW = View(HEAD_CAMERA.intrinsics, HEAD_CAMERA.extrinsics)
@@ -132,13 +133,34 @@ def test_an_object_that_a_shadow_joins_to_another_is_taken_alone() -> None:
     assert np.abs(made[-1][pixel(GOAL)].astype(int) - RED).max() < 12
 
 
-def test_what_the_robot_hides_in_the_first_frame_is_not_taken() -> None:
-    """Its place is filled with the ground; what is seen of an object next to it is carried."""
+@pytest.fixture
+def half_hidden() -> tuple[np.ndarray, np.ndarray]:
+    """A first frame in which the robot hides the right half of the object, and its render."""
     (row, column), first = pixel(START), table(START)
     render = np.full((FRAMES, 240, 320, 3), 255, np.uint8)
     render[0, row - 20 : row + 20, column : column + 40] = first[row - 20 : row + 20, column : column + 40] = (20, 20, 20)
-    made = carry(first, render, hands(path(START, GOAL)), CLOSING[:, None], VIEW)
-    dark = (made < 150).all(axis=-1)
-    assert not dark.any() and np.abs(made[0][row, column + 5].astype(int) - GROUND).max() <= 2
-    y, x = pixel(GOAL)
-    assert np.abs(made[-1][y, x - 5].astype(int) - RED).max() < 12 and made[-1][y, x + 5].min() > 200
+    return first, render
+
+
+def is_red(images: np.ndarray) -> np.ndarray:
+    return (images[..., 0] > 190) & (images[..., 1:] < 120).all(axis=-1)
+
+
+def test_what_the_robot_hides_of_an_object_is_completed_about_its_grasp(half_hidden: tuple[np.ndarray, np.ndarray]) -> None:
+    """What is seen of it, turned about the hand, stands where the robot was, before the grasp too, and moves with it."""
+    made = carry(*half_hidden, hands(path(START, GOAL)), CLOSING[:, None], VIEW)
+    red = is_red(made)
+    assert made[..., 0].min() > 190 and red.sum(axis=(1, 2)).max() < 19 * 19
+    for frame, place in ((0, START), (-1, GOAL)):
+        row, column = pixel(place)
+        assert red[frame, row - 6 : row + 7, column - 6 : column + 7].all()
+    row, column = pixel(START)
+    assert np.abs(made[-1, row, column - 8 : column + 40].astype(int) - GROUND).max() <= 2
+
+
+def test_an_object_runs_out_a_little_into_the_place_of_the_robot(half_hidden: tuple[np.ndarray, np.ndarray]) -> None:
+    """The color of an object that nothing grasps goes on for a few pixels. The ground lies beyond."""
+    made = carry(*half_hidden, hands(path(GOAL, GOAL)), CLOSING[:, None], VIEW)
+    row, column = pixel(START)
+    assert is_red(made[:, row, column]).all()
+    assert np.abs(made[:, row, column + SPREAD + 2 : column + 40].astype(int) - GROUND).max() <= 2

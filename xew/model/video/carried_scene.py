@@ -14,11 +14,11 @@ from jaxtyping import Float, UInt8
 from scipy.spatial.transform import Rotation
 
 from xew.episode import project
-from xew.model.video.ground import Image, Mask, fill, find_object
+from xew.model.video.ground import CLOSING, SPREAD, Image, Mask, complete, disk, fill, find_object, ground_color, surround
 
 Video = UInt8[np.ndarray, "t h w 3"]
-Pose = Float[np.ndarray, "7"]
-"""Position [m, world] and quaternion x y z w."""
+Pose = Float[np.ndarray, "4 4"]
+"""From a hand's frame into the world [m]."""
 
 CLOSED, STILL, LEAST_SPAN = 0.4, 0.1, 0.1
 """Shares of a gripper's range: below the first it is closed; above its least value by less than the second it holds an object.
@@ -28,8 +28,6 @@ NEAR, REACH, PASS_OVER = 0.02, 0.17, 0.1
 over to another closed hand that is nearer than the third when its own hand opens."""
 WHITE = 250
 """Least level of all channels of the white ground that the robot is rendered on."""
-RIM = 5
-"""Side of the kernel [pixels] that grows an object before its place is filled."""
 SQUARE = 0.05 * np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
 """Corners of a square before the camera [m, camera frame] whose motion with the hand moves the picture of an object."""
 
@@ -49,7 +47,7 @@ class View:
 
 @dataclass(frozen=True)
 class Sprite:
-    """The picture of an object, and the hand's pose for which it lies where it is."""
+    """The picture of an object, and where a square before the camera then was."""
 
     pixels: Image
     mask: Mask
@@ -60,13 +58,11 @@ class Sprite:
     depth: float
     """Depth of the square then [m]."""
     square: Float[np.ndarray, "4 3"]
-    """Corners of the square [m, world] with the hand at `pose`."""
-    pose: Pose
+    """Corners of the square [m] in the frame of the hand that holds the object."""
 
     def carried(self, pose: Pose) -> Float[np.ndarray, "4 3"]:
-        """Corners of the square [m, world] with the hand at another pose."""
-        turn = Rotation.from_quat(pose[3:]) * Rotation.from_quat(self.pose[3:]).inv()
-        return turn.apply(self.square - self.pose[:3]) + pose[:3]
+        """Corners of the square [m, world] with the hand at a pose."""
+        return self.square @ pose[:3, :3].T + pose[:3, 3]
 
 
 def carry(first: Image, render: Video, tools: np.ndarray, grippers: np.ndarray, view: View) -> Video:
@@ -79,21 +75,24 @@ def carry(first: Image, render: Video, tools: np.ndarray, grippers: np.ndarray, 
         grippers: [t n] commanded, larger is wider.
     """
     unseen = cv2.dilate(silhouette(render[0]), np.ones((3, 3), np.uint8))
-    canvas = fill(first, unseen)
+    poses = np.zeros((*tools.shape[:2], 4, 4))
+    poses[..., :3, 3], poses[..., :3, :3] = tools[..., :3], Rotation.from_quat(tools[..., 3:]).as_matrix()
+    canvas, ground = first.copy(), ground_color(first)
+    fill(canvas, unseen, ground)
     held: dict[int, Sprite] = {}
     closed = np.stack([find_grasps(gripper) for gripper in grippers.T], axis=1)
     before = np.zeros(closed.shape[1], bool)
     scenes = np.empty((len(tools), *canvas.shape), np.uint8)
-    for frame, (now, poses) in enumerate(zip(closed, tools, strict=True)):
+    for frame, now in enumerate(closed):
         for hand in np.flatnonzero(before & ~now).tolist():
             if hand in held:
-                _release(canvas, held, hand, np.flatnonzero(now).tolist(), tools[frame - 1], view)
+                _release(canvas, held, hand, np.flatnonzero(now).tolist(), poses[frame - 1], view)
         for hand in np.flatnonzero(now & ~before).tolist():
-            if hand not in held and (sprite := take(canvas, unseen, poses[hand], view)):
+            if hand not in held and (sprite := take(scenes[:frame], canvas, unseen, poses[frame, hand], view, ground)):
                 held[hand] = sprite
         scenes[frame] = canvas
         for hand, sprite in held.items():
-            draw(scenes[frame], sprite, poses[hand], view)
+            draw(scenes[frame], sprite, poses[frame, hand], view)
         before = now
     return scenes
 
@@ -125,21 +124,40 @@ def find_grasps(gripper: np.ndarray) -> np.ndarray:
     return grasped
 
 
-def take(canvas: Image, unseen: Mask, pose: Pose, view: View) -> Sprite | None:
-    """Cut the object at a hand out of the canvas, which is filled; None if there is none."""
-    (point,), depth = view.project(pose[None, :3])
+def take(shown: Video, canvas: Image, unseen: Mask, pose: Pose, view: View, ground: np.ndarray) -> Sprite | None:
+    """Cut the object at a hand out of the canvas [h w 3], which is filled with the ground [3]; None if there is none.
+
+    What was hidden of it is added, also to the scenes [t h w 3] shown before.
+    """
+    (point,), depth = view.project(pose[None, :3, 3])
+    if not depth > 0:
+        return None
     scale = view.intrinsics[0, 0] / depth
-    mask = find_object(canvas, unseen, point, NEAR * scale, REACH * scale) if depth > 0 else None
+    box = surround(point, point, REACH * scale)
+    part, hidden, origin = canvas[box], unseen[box], np.array([box[1].start, box[0].start])
+    mask = find_object(part, hidden, point - origin, NEAR * scale, REACH * scale, ground) if part.size else None
     if mask is None:
         return None
+    added = complete(part, hidden, mask, point - origin)
+    for scene in shown[(slice(None), *box)]:
+        cv2.copyTo(part, added, scene)
+    mask |= added
     x, y, width, height = cv2.boundingRect(mask)
-    box = slice(y, y + height), slice(x, x + width)
-    square = pose[:3] + SQUARE @ view.extrinsics[:3, :3]
+    inner = slice(y, y + height), slice(x, x + width)
+    square = pose[:3, 3] + SQUARE @ view.extrinsics[:3, :3]
     source, depth = view.project(square)
-    sprite = Sprite(canvas[box].copy(), mask[box], np.array([x, y]), source, depth, square, pose)
-    canvas[:] = fill(canvas, cv2.dilate(mask, np.ones((RIM, RIM), np.uint8)))
-    unseen[mask > 0] = 0
+    sprite = Sprite(part[inner].copy(), mask[inner], origin + [x, y], source, depth, in_hand(square, pose))
+    hole = np.zeros_like(unseen)
+    hole[box] = mask
+    rim, run_out = (cv2.dilate(hole, disk(CLOSING + size)) for size in (0, 2 * SPREAD))
+    fill(canvas, rim | (run_out & unseen), ground)
+    hidden[mask > 0] = 0
     return sprite
+
+
+def in_hand(points: Float[np.ndarray, "n 3"], pose: Pose) -> Float[np.ndarray, "n 3"]:
+    """Points [m, world] in the frame of a hand."""
+    return (points - pose[:3, 3]) @ pose[:3, :3]
 
 
 def draw(image: Image, sprite: Sprite, pose: Pose, view: View) -> None:
@@ -171,7 +189,7 @@ def _release(canvas: Image, held: dict[int, Sprite], hand: int, closed: list[int
     """Give what a hand held to a closed hand near it, or leave it where it is."""
     sprite = held.pop(hand)
     for other in closed:
-        if other not in held and np.linalg.norm(poses[other, :3] - poses[hand, :3]) < PASS_OVER:
-            held[other] = replace(sprite, square=sprite.carried(poses[hand]), pose=poses[other])
+        if other not in held and np.linalg.norm(poses[other, :3, 3] - poses[hand, :3, 3]) < PASS_OVER:
+            held[other] = replace(sprite, square=in_hand(sprite.carried(poses[hand]), poses[other]))
             return
     draw(canvas, sprite, poses[hand], view)
