@@ -26,7 +26,7 @@ from tests.sim_warp.small import TASK
 from tests.synthetic import write_synthetic_data
 from xew.config import ConfigError
 from xew.dataset import find_accepted
-from xew.episode import Record, read_record, read_states, read_video
+from xew.episode import Record, read_pixels, read_record, read_states, read_video
 from xew.metrics import METRICS
 from xew.metrics.grading.codecs import ModelCodec
 from xew.metrics.truth import NEEDS, read_truth
@@ -116,12 +116,12 @@ def test_true_grades_take_the_known_truth_and_not_an_estimate(data: Path) -> Non
 
 
 class Inverse:
-    """A codec of a model that is given the render of its robot."""
+    """A codec of a model whose decoder reads the render of the episode's commands."""
 
-    model, digest, sees_render = "inverse", "inverse", True
+    model, digest = "inverse", "inverse"
 
-    def __call__(self, video: np.ndarray, render: np.ndarray | None = None) -> np.ndarray:
-        assert render is not None and render.shape == video.shape
+    def __call__(self, video: np.ndarray, episode: Path) -> np.ndarray:
+        assert read_pixels(episode, "robot").shape == video.shape
         return 255 - video
 
 
