@@ -4,9 +4,9 @@ Reads  episodes with pictures, and rollouts of such episodes
 Writes pack: <out>/{truth,render,first,scene,episode,predicted}.npy, memory-mapped; train: weights as .safetensors
 
 A sample is a group of four frames of an episode: the truth, the commanded render around it, the episode's first frame and, with
-`--carried`, the scene in which grippers carry objects, which is given in the first frame's place. What the
-head is given was decoded from the truth's latents, half of the time with noise, or was predicted by a model. The robot and what
-moves weigh more. Nothing of the truth but the first frame reaches the head.
+`--carried`, the scene in which grippers carry objects, which is given in the first frame's place. What the head is given was
+decoded from the truth's latents, half of the time with noise, or was predicted by a model. The robot and what moves weigh more.
+Nothing of the truth but the first frame reaches the head.
 Command: python -m lab.codec.head pack --data DATA --robots body:0-11 --out PACK [--rollouts ROLLOUTS]
          python -m lab.codec.head train --packs PACK … --out xew/model/codecs/render_head.safetensors
 """
@@ -268,10 +268,8 @@ def make_step(args: Train, graph: nnx.GraphDef, optimizer: optax.GradientTransfo
     def step(state: HeadState, group: Group, codec: Any, rate: Array) -> tuple[HeadState, Array]:
         keys = jax.random.split(jax.random.fold_in(jax.random.key(args.seed), state.number), 3)
         varied = vary(keys[0], Group(*(None if part is None else pad(part) for part in group)))
-        truth, given = (
-            to_signed(varied.truth),
-            GivenFrames(varied.render, varied.first if varied.scene is None else varied.scene),
-        )
+        truth, scene = to_signed(varied.truth), varied.first if varied.scene is None else varied.scene
+        given = GivenFrames(varied.render, scene)
         is_predicted = varied.predicted is not None
         decoded = to_signed(varied.predicted) if is_predicted else decode_noisy(codec, truth, keys[1], args.noise)
 

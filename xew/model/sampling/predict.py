@@ -29,7 +29,7 @@ from xew.episode import Record, read_pixels
 from xew.model.cache.clips import gives_render, needed_pixels, read_streams, take_frames
 from xew.model.cache.scales import Scale, apply_scales
 from xew.model.codecs.contract import Codec, GivenFrames, encode_pictures, given_frames, to_pictures, to_signed
-from xew.model.conditions import Condition, clip_numbers, shown_scene
+from xew.model.conditions import Condition, clip_numbers, shows_carried
 from xew.model.devices.sharding import batch_sharding, replicated_sharding
 from xew.model.diffusion.samplers import SAMPLERS, NoiseSchedule
 from xew.model.episodes.commands import episode_command
@@ -150,7 +150,8 @@ class Predictor:
         command = episode_command(folder, record, pixels.get("robot"), pixels.get("rgb"))
         given = {FIRST: read_pixels(folder, "rgb", most=1, record=record)}
         if gives_render(self.codec, inputs.conditions):
-            given |= {RENDER: pixels["robot"], SCENE: shown_scene(inputs.conditions.values(), command)}
+            scene = command.carried_scene if shows_carried(inputs.conditions.values()) else given[FIRST]
+            given |= {RENDER: pixels["robot"], SCENE: scene}
         resized = {name: to_model_size(video, clip.height, clip.width) for name, video in given.items()}
         return record, resized | read_streams(inputs.conditions, clip, folder, record, names, pixels, command)
 
