@@ -50,6 +50,8 @@ FORMATS = "matroska,webm,mov,mp4,m4a,3gp,3g2,mj2,avi"
 """Containers that are read, by FFmpeg's names. Others, such as playlists, may make FFmpeg open further files."""
 SLOWEST, FASTEST = 1.0, 1000.0
 """Range of frame rates [Hz]."""
+WHITE = 250
+"""Least level of all channels of the white ground that robots are rendered on alone, as in robot.mkv."""
 TEMPORARY = ".writing-"
 """Prefix of the name of an incomplete folder."""
 UNPACKED_BYTES, UNPACKED_RATIO = 2**27, 100

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from tests import synthetic
-from xew.episode import read_record, read_states
-from xew.metrics.grading import baselines
+from xew.episode import WHITE, read_record, read_states
 from xew.model.conditions import carried_render, make_command, pasted_render
-from xew.model.video.carried_scene import WHITE, View, carry, find_grasps
+from xew.model.video.carried_scene import View, carry, find_grasps
 from xew.model.video.ground import SPREAD
 from xew.sim_warp.geometry.camera import HEAD_CAMERA, project
 
@@ -118,8 +117,8 @@ def test_the_condition_is_the_render_in_the_carried_scene(tmp_path: Path) -> Non
     made, pasted = carried_render(command), pasted_render(command)
     assert made.shape == pasted.shape == command.carried_scene.shape and made.dtype == np.uint8
     np.testing.assert_array_equal(made[0], pasted[0])
-    robot = command.render.min(axis=-1) < baselines.WHITE
-    assert WHITE == baselines.WHITE and robot.any()
+    robot = command.render.min(axis=-1) < WHITE
+    assert WHITE == WHITE and robot.any()
     np.testing.assert_array_equal(made[1:][robot[1:]], pasted[1:][robot[1:]])
 
 

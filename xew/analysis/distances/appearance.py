@@ -7,10 +7,9 @@ import numpy as np
 from scipy.spatial.distance import pdist, squareform
 
 from xew.analysis.distances.matrices import symmetric_matrix
+from xew.episode import WHITE
 
 HUE_BINS = SATURATION_BINS = 16
-WHITE = 250
-"""Level from which on, in all channels, a pixel of a robot-only render is background."""
 
 ImageEmbedding = Callable[[np.ndarray], np.ndarray]
 """Vectors [n d] of images [n h w 3] uint8, whose squared Euclidean distances say how different the images look."""

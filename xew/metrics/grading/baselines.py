@@ -13,12 +13,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from xew.episode import Record, read_pixels, read_record
+from xew.episode import WHITE, Record, read_pixels, read_record
 from xew.metrics.truth import Truth
 from xew.protocol import COPY_FIRST_FRAME, GROUND_TRUTH, OTHER_ROBOT, PASTED_RENDER
 
-WHITE = 250
-"""Least level of all channels of the white ground that the robot is rendered on."""
 GROWN = 1
 """Number of pixels by which the robot of the first frame is grown before it is filled in, for its soft outline."""
 FILL_RADIUS = 5

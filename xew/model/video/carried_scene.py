@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from scipy.spatial.transform import Rotation
 
-from xew.episode import project
+from xew.episode import WHITE, project
 from xew.model.video.ground import CLOSING, SPREAD, Image, Mask, complete, disk, fill, find_object, ground_color, surround
 
 Video = UInt8[np.ndarray, "t h w 3"]
@@ -26,8 +26,6 @@ A gripper whose range is below the third never closes."""
 NEAR, REACH, PASS_OVER = 0.02, 0.17, 0.1
 """Distances [m] from the point between the fingers: a held object is nearer than the first, cut off beyond the second, and goes
 over to another closed hand that is nearer than the third when its own hand opens."""
-WHITE = 250
-"""Least level of all channels of the white ground that the robot is rendered on."""
 SQUARE = 0.05 * np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
 """Corners of a square before the camera [m, camera frame] whose motion with the hand moves the picture of an object."""
 
