@@ -41,7 +41,7 @@ from xew.model.codecs.render_head import HeadSize, RenderHead, robot_pixels
 from xew.model.codecs.vae_layers import as_row
 from xew.model.episodes.commands import episode_command
 from xew.model.video.frames import TEMPORAL_FACTOR, padding_to
-from xew.protocol import expand_robots, seed_split
+from xew.protocol import expand_robots
 from xew.rollout import read_rollout, read_rollout_video
 
 HEIGHT, WIDTH = 256, 320
@@ -125,11 +125,9 @@ def list_starts(frames: int, seed: int, every: int) -> range:
 
 def pack(args: Pack) -> None:
     """Write the groups of a data set, or of its rollouts; episodes are read in as many processes as there are cores."""
-    robots = expand_robots(args.robots)
     episodes = [
         (folder, record)
-        for folder, record in read_dataset(args.data).cells
-        if record.success and record.videos and record.robot in robots and seed_split(record.seed) == "train"
+        for folder, record in read_dataset(args.data).select(robots=expand_robots(args.robots), split="train")
         if args.rollouts is None or (_rollout(args, record) / "rgb.mkv").exists()
     ]
     counts = [len(list_starts(record.frame_count, record.seed, args.every)) for _, record in episodes]
