@@ -35,7 +35,7 @@ from xew.config import ConfigError, parse
 from xew.files import LoadedFile, check_place, file_digest, load_file, read_json, sweep
 from xew.names import EpisodeError as EpisodeError
 from xew.names import check_label, check_name, folder_name, name_of_folder, path_below
-from xew.protocol import FRAME_RATE, MOTIONS, SHARED_MOTION
+from xew.protocol import FRAME_RATE, MOTIONS, SHARED_MOTION, parse_change
 
 SCHEMA_VERSION = 2
 WIDTH, HEIGHT = 320, 240
@@ -147,6 +147,8 @@ class Record:
     """Whether rgb and robot are stored. If not, `python -m xew.sim_warp.inspect --render` renders them."""
     motion: str = SHARED_MOTION
     """Kind of motion, one of `xew.protocol.MOTIONS`."""
+    change: str = ""
+    """The scene's one change as `FACTOR:LEVEL` (`xew.protocol.parse_change`); empty for an unchanged scene."""
     files: dict[str, str] = field(default_factory=dict)
     """SHA-256 of the files as they were written, by name. The decoded bytes of such a file need not be compared."""
 
@@ -310,6 +312,7 @@ def _check_record(record: Record) -> Record:
         raise ValueError(str(error).rstrip(".")) from error
     if record.motion not in MOTIONS:
         raise ValueError(f"its motion is {record.motion!r}, expected {' or '.join(MOTIONS)}")
+    parse_change(record.change)
     if not SLOWEST <= record.frame_rate <= FASTEST or record.frame_count < 0:
         raise ValueError(f"it has {record.frame_count} frames at {record.frame_rate} a second")
     return record

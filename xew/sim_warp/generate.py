@@ -25,7 +25,8 @@ from xew.config import user_errors
 from xew.dataset import find_records
 from xew.episode import EpisodeError, Record, remove_left_overs
 from xew.files import hold_lock
-from xew.protocol import SEED_STARTS, TEST_SEEDS_PER_TASK, TRAIN_SEEDS_PER_TASK, expand_robots, seed_split
+from xew.protocol import SEED_STARTS, TEST_SEEDS_PER_TASK, TRAIN_SEEDS_PER_TASK, expand_robots, seed_split, split_key
+from xew.sim_warp.changes.scenes import check_change, demand_change
 from xew.sim_warp.devices.workers import Workers, find_device, find_devices, quiet_warp, worker_count
 from xew.sim_warp.manifest import PACKAGED, Manifest, read_manifest
 from xew.sim_warp.production.cells import Job
@@ -58,7 +59,11 @@ class Args:
     """Number of accepted seeds per task of the block reserved for the final study."""
     test_robots: tuple[str, ...] = ()
     """Robots of the test seeds; default: --robots."""
-    out: Path = Path("data")
+    change: str = ""
+    """One change of all scenes, as FACTOR:LEVEL: light, background, table, clutter, height or camera, with levels 1, 2, 3 of
+    growing strength (docs/cameras.md). random: a change is drawn for each scene, for training."""
+    out: Path | None = None
+    """Folder of the data set; default: data, with a change such as light:2 data_light_2."""
     batch: int = 256
     """Number of worlds that a GPU steps together. On a CPU each worker steps one world at a time."""
     workers: int | None = None
@@ -80,13 +85,18 @@ class Args:
     search: bool = False
     """Try every seed, ignoring the manifest."""
 
+    @property
+    def folder(self) -> Path:
+        """Folder of the data set."""
+        return self.out or Path(split_key("data", self.motion, self.change))
+
 
 @contextmanager
 def start_workers(args: Args, robots: Mapping[str, RobotSpec]) -> Iterator[Callable[[Sequence[Job]], Iterator[Timed]]]:
     """Start worker processes with compiled kernels; yields the function that makes the scenes of jobs."""
     devices = find_devices(args.device)
     physics = find_device(args.physics) if args.physics else devices[0]
-    production = Production(args.out, robots, physics.is_cuda, args.batch, not args.states_only)
+    production = Production(args.folder, robots, physics.is_cuda, args.batch, not args.states_only)
     with Workers(args.workers or worker_count(devices, physics), devices) as workers:
         parts = {"physics": physics.alias, "kinematics": physics.alias, "rendering": devices[0].alias}
         compile_on_devices(workers, parts, args.batch)
@@ -96,8 +106,8 @@ def start_workers(args: Args, robots: Mapping[str, RobotSpec]) -> Iterator[Calla
 def generate(args: Args) -> list[Family]:
     """Make missing episodes; returns all families with their records."""
     _check(args)
-    robots = _find_robots(args.robots, args.out)
-    tested = _find_robots(args.test_robots, args.out) or robots
+    robots = _find_robots(args.robots, args.folder)
+    tested = _find_robots(args.test_robots, args.folder) or robots
     manifest = Manifest() if args.search else read_manifest(args.manifest)
     teams = dict.fromkeys(SEED_STARTS, tuple(robots)) | dict.fromkeys(("test", "final"), tuple(tested))
     families = plan_seeds(args, teams, manifest)
@@ -128,11 +138,12 @@ def plan_seeds(args: Args, robots: Mapping[str, Sequence[str]], manifest: Manife
         "test": args.test_seeds,
         "final": args.final_seeds,
     }
-    return plan_families(args.tasks, wanted, robots, manifest, motion=args.motion, unpaired=args.unpaired)
+    return plan_families(args.tasks, wanted, robots, manifest, motion=args.motion, change=args.change, unpaired=args.unpaired)
 
 
 def _check(args: Args) -> None:
-    """Check tasks and numbers before any work. Raises ConfigError or EpisodeError."""
+    """Check tasks, the change and numbers before any work. Raises ConfigError or EpisodeError."""
+    check_change(args.change)
     for task in args.tasks:
         get_task(task)
     if args.workers is not None and args.workers < 1:
@@ -177,9 +188,9 @@ def _read_existing(families: list[Family], args: Args) -> None:
 
     Raises:
         EpisodeError: a header is damaged or in a wrong folder, an episode of these tasks was imported, or the data set has
-            no videos or another kind of motion.
+            no videos, another kind of motion or another change.
     """
-    out = args.out
+    out = args.folder
     for folder, record in find_records(out):
         if not record.videos and not args.states_only:
             raise EpisodeError(
@@ -190,6 +201,7 @@ def _read_existing(families: list[Family], args: Args) -> None:
             raise EpisodeError(
                 f"{out} holds episodes of {record.motion} motion, expected {args.motion} motion; choose another --out."
             )
+        demand_change(folder, record, args.change)
         for family in families:
             if args.unpaired and record.robot not in family.robots:
                 continue
@@ -215,7 +227,7 @@ def main() -> None:
     quiet_warp()
     args = tyro.cli(Args, description=__doc__)
     print(f"device: {', '.join(device.name for device in find_devices(args.device))}")
-    with hold_lock(args.out):
+    with hold_lock(args.folder):
         families = generate(args)
     print(yield_table([record for family in families for seed in family.done.values() for record in seed.values()]))
     demand_enough(families)

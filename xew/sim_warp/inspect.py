@@ -5,7 +5,8 @@ Writes a table to the terminal and, with options, pictures: a sheet per seed (st
        per episode (eight frames of the scene over eight of the robot alone); a grid of all tasks and robots; or a page
        with the robots' synchronized videos, overlays and predictions (`inspection/explorer.py`)
 
-Command: python -m xew.sim_warp.inspect data [--verify] [--visibility] [--rerender 5] [--render] [--pictures sheets]
+Command: python -m xew.sim_warp.inspect data [--verify] [--visibility] [--rerender 5] [--render [--change light:2 --out NEW]]
+         [--pictures sheets]
          [--grid grid.png] [--page explorer [--scenes open_laptop stack_bowls_two/0] [--rollouts rollouts/fixed]]
 """
 
@@ -21,7 +22,7 @@ from xew.episode import EpisodeError, Record
 from xew.files import hold_lock
 from xew.names import plain_line
 from xew.sim_warp.devices.workers import quiet_warp
-from xew.sim_warp.inspection.checks import render_videos, rerender, verify
+from xew.sim_warp.inspection.checks import render_changes, render_videos, rerender, verify
 from xew.sim_warp.inspection.explorer import Page, choose_scenes, find_predictions, write_page
 from xew.sim_warp.inspection.pictures import draw_grid, draw_pictures
 from xew.sim_warp.inspection.visibility import visibility_section
@@ -43,6 +44,10 @@ class Args:
     """Number of episodes to render again from their states and compare with the recorded hashes."""
     render: bool = False
     """Make and store the videos of episodes that were generated with --states-only."""
+    change: str = ""
+    """With --render and --out: write the data set with this change, such as light:2, from its states without physics."""
+    out: Path | None = None
+    """Folder of the changed data set."""
     pictures: Path | None = None
     """Folder for contact sheets and strips."""
     seeds: int = 2
@@ -68,6 +73,7 @@ def main() -> None:
     quiet_warp()
     args = tyro.cli(Args, description=__doc__)
     admit(args.trust)
+    check_change_options(args)
     cells, damaged = read_headers(args.data)
     print(yield_table([record for _, record in cells]))
     for folder, record in cells:
@@ -85,8 +91,7 @@ def main() -> None:
     if args.rerender:
         rerender([folder for folder, _ in pictured], args.rerender)
     if args.render:
-        with hold_lock(args.data):
-            render_videos([folder for folder, record in pictured if not record.videos])
+        render(pictured, args)
     if args.pictures:
         with hold_lock(args.pictures):
             draw_pictures(pictured, args.pictures, args.seeds)
@@ -95,6 +100,23 @@ def main() -> None:
             draw_grid(pictured, args.grid)
     if args.page:
         make_page(pictured, args)
+
+
+def check_change_options(args: Args) -> None:
+    """Raise EpisodeError if only some of --render, --change and --out are given."""
+    if (args.change or args.out) and not (args.render and args.change and args.out):
+        raise EpisodeError(
+            "--change needs --render and --out, as in: inspect DATA --render --change light:2 --out data_light_2"
+        )
+
+
+def render(cells: list[tuple[Path, Record]], args: Args) -> None:
+    """Make missing videos, or with --change the episodes of another data set."""
+    with hold_lock(args.out or args.data):
+        if args.out:
+            render_changes([folder for folder, _ in cells], args.change, args.out)
+        else:
+            render_videos([folder for folder, record in cells if not record.videos])
 
 
 def show_visibility(folders: list[Path], args: Args) -> None:

@@ -1,17 +1,24 @@
 """Checks of a data set: hashes, plausible motion and re-rendering; and rendering of missing videos."""
 
-from functools import cache
+from collections.abc import Callable, Iterator
+from functools import cache, partial
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from tqdm import tqdm
 
 from xew.concurrency import usable_cores
-from xew.episode import EpisodeError, verify_episode
+from xew.episode import EpisodeError, Record, data_folder, verify_episode
+from xew.protocol import RANDOM_CHANGE
+from xew.sim_warp.changes.scenes import check_change
 from xew.sim_warp.devices.workers import Workers, find_devices, worker_count
-from xew.sim_warp.production.rerender import add_videos, demand_plausible, render_again
+from xew.sim_warp.production.rerender import add_videos, demand_plausible, render_again, render_changed
 from xew.sim_warp.production.warm_up import compile_kernels
 from xew.sim_warp.rendering.render import Renderer
+from xew.sim_warp.robots.user.own import KEPT, keep_robot, kept_robot
+
+Result = TypeVar("Result")
 
 EPISODES_PER_WORKER = 32
 """Number of episodes that justify one more process, by its start-up time."""
@@ -49,21 +56,47 @@ def rerender(folders: list[Path], count: int) -> None:
 
 def render_videos(folders: list[Path]) -> None:
     """Make and store the videos of episodes that have none."""
+    for _ in map_rendering(_render_video, folders):
+        pass
+    print(f"videos of {len(folders)} episodes made from their states")
+
+
+def map_rendering(render: Callable[[Path], Result], folders: list[Path]) -> Iterator[Result]:
+    """The result of a function for each folder, in worker processes if there are many folders."""
     devices = find_devices(None)
     several = len(folders) >= 2 * EPISODES_PER_WORKER
     with Workers(worker_count(devices), devices) as workers:
         if several:
             compile_kernels(workers, devices[0], 1, ("rendering",))
-        results = workers.run(_render_video, folders) if several else map(_render_video, folders)
-        for _ in tqdm(results, desc="rendering", unit="episode", total=len(folders)):
-            pass
-    print(f"videos of {len(folders)} episodes made from their states")
+        results = workers.run(render, folders) if several else map(render, folders)
+        yield from tqdm(results, desc="rendering", unit="episode", total=len(folders))
+
+
+def render_changes(folders: list[Path], change: str, out: Path) -> None:
+    """Write episodes of one data set with a change to another, from their states. Raises EpisodeError if it needs physics."""
+    check_change(change)
+    if change.partition(":")[0] in ("height", RANDOM_CHANGE):
+        raise EpisodeError(f"the change {change} needs physics; run `python -m xew.sim_warp.generate --change {change}`.")
+    data = data_folder(folders[0])
+    for key in sorted({folder.name for folder in folders}):
+        if (data / KEPT / key).is_dir() and (robot := kept_robot(key, data)) is not None:
+            keep_robot(robot, out)
+    failed = [
+        record for record in map_rendering(partial(_render_change, change=change, out=out), folders) if not record.success
+    ]
+    print(f"{len(folders) - len(failed)} of {len(folders)} episodes rendered with the change {change} into {out}")
+    for record in failed:
+        print(f"{record.task} {record.seed} {record.robot}: {record.failure_detail}")
 
 
 @cache
 def _renderer() -> Renderer:
     """The renderer of this process on its own device, made once."""
     return Renderer()
+
+
+def _render_change(folder: Path, change: str, out: Path) -> Record:
+    return render_changed(folder, change, out, _renderer())
 
 
 def _render_video(folder: Path) -> None:

@@ -8,22 +8,28 @@ import numpy as np
 from xew.episode import (
     EpisodeError,
     Record,
+    States,
     array_hash,
     data_folder,
     demand_known,
+    place_episode,
     read_record,
     read_states,
     states_hash,
     write_episode,
 )
-from xew.protocol import OWN_MOTION
+from xew.protocol import OWN_MOTION, parse_change
+from xew.sim_warp.changes.looks import camera_of, stage_of
+from xew.sim_warp.changes.scenes import change_of, demand_change, make_plan, make_scene
+from xew.sim_warp.embodiment.spec import RobotSpec
 from xew.sim_warp.kinematics.own_motion import own_commands
 from xew.sim_warp.physics.plausibility import find_implausible
+from xew.sim_warp.production.outcome import find_obstruction
 from xew.sim_warp.rendering.observe import observe, scene_recording
 from xew.sim_warp.rendering.render import Renderer
 from xew.sim_warp.rendering.streams import command_renders
 from xew.sim_warp.robots import recorded_robot
-from xew.sim_warp.scene import Scene, scene_hash, scene_rng
+from xew.sim_warp.scene import Scene, scene_hash
 from xew.sim_warp.tasks import recorded_task
 
 
@@ -39,11 +45,9 @@ def render_again(folder: Path, renderer: Renderer) -> tuple[np.ndarray, np.ndarr
     record = read_record(folder)
     robot = recorded_robot(record.robot, data_folder(folder))
     demand_known(folder, "joint_pos", "object_pose")
-    states, scene = read_states(folder), _sample_again(folder, record)
-    view = observe(renderer, [scene_recording(robot, scene, states.joint_pos, states.object_pose, states.object_joint)])[0]
-    render = command_renders([(robot, states.action)], renderer=renderer)[0]
-    again = replace(states, keypoints=view.keypoints, keypoint_visible=view.keypoint_visible, robot_mask=view.robot_mask)
-    hashes = {"states": states_hash(again), "rgb": array_hash(view.rgb), "robot": array_hash(render)}
+    scene = _sample_again(folder, record)
+    again, rgb, render = _draw(robot, scene, read_states(folder), record.change, renderer)
+    hashes = {"states": states_hash(again), "rgb": array_hash(rgb), "robot": array_hash(render)}
     hashes["scene"] = scene_hash(scene)
     for name, recorded in (record.hashes | {"scene": record.scene_hash}).items():
         if hashes[name] != recorded:
@@ -51,7 +55,60 @@ def render_again(folder: Path, renderer: Renderer) -> tuple[np.ndarray, np.ndarr
                 f"{folder}: rendered again on {renderer.device.name}, {name} has hash {hashes[name][:12]}, expected "
                 f"{recorded[:12]} as recorded on {record.device}. Use the same device and versions as for the recording."
             )
-    return view.rgb, render
+    return rgb, render
+
+
+def _draw(
+    robot: RobotSpec, scene: Scene, states: States, change: str, renderer: Renderer
+) -> tuple[States, np.ndarray, np.ndarray]:
+    """The states with what the camera sees of them, and the head camera's and the robot's video [t h w 3] uint8."""
+    wanted = parse_change(change)
+    camera = camera_of(wanted)
+    recording = scene_recording(robot, scene, states.joint_pos, states.object_pose, states.object_joint)
+    view = observe(renderer, [recording], camera, stage_of(wanted))[0]
+    seen = replace(
+        states,
+        keypoints=view.keypoints,
+        keypoint_visible=view.keypoint_visible,
+        robot_mask=view.robot_mask,
+        intrinsics=camera.intrinsics,
+        extrinsics=camera.extrinsics,
+    )
+    return seen, view.rgb, command_renders([(robot, states.action)], camera, renderer)[0]
+
+
+def render_changed(folder: Path, name: str, out: Path, renderer: Renderer) -> Record:
+    """Write an unchanged episode with a change, from its states, to another data set; returns its header.
+
+    Args:
+        folder: of the accepted episode.
+        name: a change that needs no physics.
+        out: root of the other data set.
+        renderer: of this process.
+
+    Raises:
+        EpisodeError: the episode is changed already, was imported, or stands in the other data set with another change.
+    """
+    record = read_record(folder)
+    change = change_of(name, record.task, record.seed)
+    place = place_episode(out, record.task, record.seed, record.robot)
+    if (place / "episode.json").is_file():
+        there = read_record(place)
+        demand_change(place, there, name)
+        return there
+    if record.change or record.source:
+        origin = f"was imported from {record.source}" if record.source else f"has the change {record.change}"
+        raise EpisodeError(f"{folder} {origin}; expected an unchanged episode that `python -m xew.sim_warp.generate` made.")
+    robot = recorded_robot(record.robot, data_folder(folder))
+    task = recorded_task(record.task)
+    scene = make_scene(task, record.task, record.seed, change)
+    states, rgb, render = _draw(robot, scene, read_states(folder), change, renderer)
+    recording = scene_recording(robot, scene, states.joint_pos, states.object_pose, states.object_joint)
+    changed = replace(record, change=change, scene_hash=scene_hash(scene), device=renderer.device.name)
+    if failure := find_obstruction(scene, recording):
+        failed = replace(changed, success=False, failure=failure[0], failure_detail=failure[1], hashes={}, files={})
+        return read_record(write_episode(out, failed))
+    return read_record(write_episode(out, changed, states, rgb, render))
 
 
 def add_videos(folder: Path, renderer: Renderer) -> None:
@@ -66,7 +123,7 @@ def demand_plausible(folder: Path) -> None:
     """Raise EpisodeError if an accepted episode's motion is implausible (plausibility.py)."""
     record, states = read_record(folder), read_states(folder)
     scene = _sample_again(folder, record)
-    plan = recorded_task(record.task).plan(scene)
+    plan = make_plan(recorded_task(record.task), scene)
     robot = recorded_robot(record.robot, data_folder(folder)) if record.motion == OWN_MOTION else None
     holds = (own_commands(robot, [plan])[0][0] if robot else plan.path()).holds
     problem = find_implausible(
@@ -78,7 +135,7 @@ def demand_plausible(folder: Path) -> None:
 
 def _sample_again(folder: Path, record: Record) -> Scene:
     """The scene of an episode. Raises EpisodeError if its task has other objects now."""
-    scene = recorded_task(record.task).sample(scene_rng(record.task, record.seed), record.seed)
+    scene = make_scene(recorded_task(record.task), record.task, record.seed, record.change)
     if scene.names != record.object_names:
         raise EpisodeError(
             f"{folder} has the objects {', '.join(record.object_names)}, {record.task} now makes {', '.join(scene.names)}: "

@@ -9,7 +9,7 @@ from xew.sim_warp import stage
 from xew.sim_warp.geometry.camera import Camera
 from xew.sim_warp.rendering import raster_kernels as raster
 from xew.sim_warp.rendering import shading_kernels as shading
-from xew.sim_warp.rendering.lighting import SHADOW_SIZE, camera_view, light_of, stage_shading
+from xew.sim_warp.rendering.lighting import SHADOW_SIZE, camera_view, light_of, pack_patterns, stage_shading
 from xew.sim_warp.rendering.packing import Body, FrameTable, PackedGeometry, World, pack_frames, pack_geometry
 
 FLOW_LIMIT = 25.0
@@ -17,6 +17,15 @@ FLOW_LIMIT = 25.0
 STRIPES = {"cpu": 1, "cuda": 8}
 """Number of threads per triangle; a GPU splits large triangles by rows."""
 IDENTITY = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+
+
+@dataclass(frozen=True)
+class Look:
+    """Lights and shading of a stage as arguments of the kernels."""
+
+    lights: wp.array
+    """[l] raster.Light."""
+    shading: shading.Shading
 
 
 @dataclass(frozen=True)
@@ -29,6 +38,7 @@ class Call:
     camera: Camera
     view: raster.View
     """The camera as an argument of the kernels."""
+    look: Look
     stage: shading.LitStage
     shadows: int = 0
     """Number of lights with shadow maps."""
@@ -72,10 +82,13 @@ class Passes:
     def __init__(self, device: wp.Device) -> None:
         self.device = device
         self._stripes = STRIPES["cuda" if device.is_cuda else "cpu"]
-        self._lights = wp.array([light_of(light) for light in stage.LIGHTS], dtype=raster.Light, device=device)
-        self._shading = stage_shading()
         ramp = stage.srgb_from_linear(np.linspace(0, 1, shading.COLORS))
         self._srgb = wp.array(ramp, dtype=wp.uint8, device=device)
+
+    def look(self, shown: stage.Stage) -> Look:
+        """Lights and shading of a stage on the device."""
+        lights = wp.array([light_of(light) for light in shown.lights], dtype=raster.Light, device=self.device)
+        return Look(lights, stage_shading(shown.ambient))
 
     def draw(self, call: Call, chunk: Chunk) -> Drawn:
         """Visibility of a chunk's frames and, if there are shadows, their shadow maps."""
@@ -90,7 +103,7 @@ class Passes:
         self._launch(
             raster.place_vertices,
             (count, chunk.vertex_count),
-            [call.geometry.arrays, chunk.world, chunk.pose, call.pose, call.view, self._lights],
+            [call.geometry.arrays, chunk.world, chunk.pose, call.pose, call.view, call.look.lights],
             [drawn.vertex, drawn.shadow_vertex],
         )
         self._launch(
@@ -116,7 +129,7 @@ class Passes:
         self._launch(
             shading.shade_pixels,
             (chunk.count, height, width),
-            [*posed, self._lights, self._shading, call.stage, self._srgb, *seen],
+            [*posed, call.look.lights, call.look.shading, call.stage, self._srgb, *seen],
             [rgb],
         )
         return rgb
@@ -148,20 +161,22 @@ class Passes:
         )
         return images
 
-    def light_stage(self, camera: Camera, ground: bool) -> shading.LitStage:
-        """The lit stage in the view of a camera; empty without a ground."""
-        bodies = [Body(stage.stage_mesh(), False)] if ground else []
+    def light_stage(self, camera: Camera, shown: stage.Stage | None, look: Look) -> shading.LitStage:
+        """A stage with its look in the view of a camera; empty without a stage."""
+        bodies = [] if shown is None else [Body(stage.stage_mesh(shown), False)]
         table, pose = pack_frames([World(bodies, np.tile(IDENTITY, (1, len(bodies), 1)))], [0])
         call = Call(
             geometry=pack_geometry([bodies], self.device),
             pose=wp.array(pose, dtype=wp.transform, device=self.device),
             camera=camera,
             view=camera_view(camera),
+            look=look,
             stage=shading.LitStage(),
         )
         chunk = Chunk(self.device, call.geometry, table)
         drawn = self.draw(call, chunk)
-        height, width, lights = camera.height, camera.width, len(stage.LIGHTS) if ground else 0
+        height, width, lights = camera.height, camera.width, 0 if shown is None else len(shown.lights)
+        patterns = pack_patterns(shown or stage.STANDARD, self.device)
         lit = shading.LitStage()
         lit.key = drawn.key[0]
         lit.ambient = self._zeros((height, width), wp.vec3)
@@ -170,7 +185,16 @@ class Passes:
         self._launch(
             shading.light_stage,
             (height, width),
-            [call.geometry.arrays, call.view, self._lights, self._shading, drawn.vertex, drawn.key, wp.vec3(*stage.SKY)],
+            [
+                call.geometry.arrays,
+                call.view,
+                look.lights,
+                look.shading,
+                drawn.vertex,
+                drawn.key,
+                wp.vec3(*stage.SKY),
+                patterns,
+            ],
             [lit.ambient, lit.direct, lit.shadow_texel],
         )
         return lit

@@ -11,7 +11,6 @@ import numpy as np
 import warp as wp
 
 from xew.concurrency import PARSING
-from xew.sim_warp import stage
 from xew.sim_warp.devices.waiting import wait_for
 from xew.sim_warp.geometry.camera import HEAD_CAMERA, Camera, project
 from xew.sim_warp.rendering import shading_kernels as shading
@@ -26,14 +25,15 @@ from xew.sim_warp.rendering.packing import (
     pack_geometry,
     pack_points,
 )
-from xew.sim_warp.rendering.passes import FLOW_LIMIT, Call, Chunk, Passes
+from xew.sim_warp.rendering.passes import FLOW_LIMIT, Call, Chunk, Look, Passes
+from xew.sim_warp.stage import STANDARD, Stage
 
 __all__ = ["FLOW_LIMIT", "Body", "Frames", "Renderer", "World"]
 
 FRAMES_PER_CHUNK = {"cpu": 4, "cuda": 512}
 """Number of frames on the device at once, about 6 MB each."""
 STAGES_KEPT = 16
-"""Number of cameras with a cached lit stage, about 10 MB each."""
+"""Number of cameras and stages with a cached lit stage, about 10 MB each."""
 
 
 def _nothing() -> np.ndarray:
@@ -75,7 +75,7 @@ class Renderer:
         self._frames_per_chunk = frames_per_chunk or FRAMES_PER_CHUNK[kind]
         self._passes = Passes(self.device)
         self._pinned = wp.empty(0, dtype=wp.uint8, device="cpu")
-        self._stages: dict[tuple[bytes, int, int], shading.LitStage] = {}
+        self._stages: dict[tuple[bytes, int, int, Stage | None], tuple[Look, shading.LitStage]] = {}
 
     def render(
         self,
@@ -99,6 +99,7 @@ class Renderer:
         camera: Camera = HEAD_CAMERA,
         ground: bool = True,
         *,
+        stage: Stage = STANDARD,
         depth: bool = False,
         body: bool = False,
         optical_flow: bool = False,
@@ -107,6 +108,7 @@ class Renderer:
 
         Args:
             ground: True for table, wall, ground and shadows; False for the bodies alone on white, without shadows.
+            stage: table, wall, ground and lights of all worlds; without the ground the light is the standard one.
             depth, body, optical_flow: requests for the optional images of `Frames`.
 
         Raises:
@@ -119,9 +121,9 @@ class Renderer:
         optional = {"depth": depth, "body": body, "optical_flow": optical_flow}
         wanted = frozenset(name for name, asked_for in optional.items() if asked_for)
         with PARSING:  # threads share the device's buffers and modules
-            return _split_by_world(self._render_worlds(worlds, camera, ground, wanted), worlds)
+            return _split_by_world(self._render_worlds(worlds, camera, stage if ground else None, wanted), worlds)
 
-    def probe_batch(self, worlds: Sequence[World], camera: Camera = HEAD_CAMERA) -> list[Frames]:
+    def probe_batch(self, worlds: Sequence[World], camera: Camera = HEAD_CAMERA, stage: Stage = STANDARD) -> list[Frames]:
         """As `render_batch` with stage, bodies and depth, but without `rgb`, for worlds with points.
 
         Raises:
@@ -134,22 +136,24 @@ class Renderer:
         if not worlds:
             return []
         with PARSING:
-            images = self._render_worlds(worlds, camera, True, frozenset({"body", "depth"}), colors=False)
+            images = self._render_worlds(worlds, camera, stage, frozenset({"body", "depth"}), colors=False)
             return _split_by_world(images, worlds)
 
     def _render_worlds(
-        self, worlds: Sequence[World], camera: Camera, ground: bool, wanted: frozenset[str], colors: bool = True
+        self, worlds: Sequence[World], camera: Camera, stage: Stage | None, wanted: frozenset[str], colors: bool = True
     ) -> dict[str, np.ndarray]:
         """Images of all frames of all worlds on the host, by the names of `Frames`; colors, with shadows, if asked for."""
         kinds, kind = distinct_worlds(worlds)
         table, pose = pack_frames(worlds, kind)
+        look, lit = self._stage(camera, stage)
         call = Call(
             geometry=pack_geometry(kinds, self.device),
             pose=wp.array(pose, dtype=wp.transform, device=self.device),
             camera=camera,
             view=camera_view(camera),
-            stage=self._stage(camera, ground),
-            shadows=len(stage.LIGHTS) if ground and colors else 0,
+            look=look,
+            stage=lit,
+            shadows=len(stage.lights) if stage and colors else 0,
             wanted=wanted,
             colors=colors,
         )
@@ -186,14 +190,15 @@ class Renderer:
             images |= passes.probe(call, chunk, drawn, pixel)
         return images
 
-    def _stage(self, camera: Camera, ground: bool) -> shading.LitStage:
-        """The lit stage of a camera, cached; without a ground one entry serves all cameras of a size."""
-        view = camera.intrinsics.tobytes() + camera.extrinsics.tobytes() if ground else b""
-        key = (view, camera.width, camera.height)
+    def _stage(self, camera: Camera, stage: Stage | None) -> tuple[Look, shading.LitStage]:
+        """The lit stage of a camera with its look, cached; without a stage one entry serves all cameras of a size."""
+        view = camera.intrinsics.tobytes() + camera.extrinsics.tobytes() if stage else b""
+        key = (view, camera.width, camera.height, stage)
         if key not in self._stages:
             if len(self._stages) >= STAGES_KEPT:
                 self._stages.clear()
-            self._stages[key] = self._passes.light_stage(camera, ground)
+            look = self._passes.look(stage or STANDARD)
+            self._stages[key] = look, self._passes.light_stage(camera, stage, look)
         return self._stages[key]
 
 
