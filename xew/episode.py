@@ -7,6 +7,9 @@ An episode is a folder `<data>/<task>/<seed>/<robot>/`:
     robot.mkv      the robot alone, posed by the commanded joints, on a white ground, lossless
 Folders appear under their final name only when complete. A rejected cell has only its episode.json.
 
+Another camera's view of the data is a data set of the same form below it, `<data>/views/<view>/<task>/<seed>/<robot>/`
+(`view_folder`). Its states are the episode's, with that camera's keypoints, mask and matrices.
+
 Shape letters, here and everywhere: t frames, h w c image, j joints, a action, o objects, k keypoints, n worlds, b batch.
 Quaternions are x y z w; the world frame has its origin under the table's center, x right, y away from the robot, z up.
 """
@@ -58,6 +61,8 @@ UNPACKED_BYTES, UNPACKED_RATIO = 2**27, 100
 """Largest size of the unpacked arrays of an .npz: a number of bytes, and this many times the size of the file."""
 MOST_PIXELS = 4096 * 4096
 """Largest number of pixels of a frame of an episode's video."""
+LARGEST_SIDE = 4096
+"""Largest width and height of a camera's picture [pixels]."""
 PROBED_STREAMS = 8
 """Number of streams of a container to which MOST_PIXELS applies while it is opened."""
 FORMS = {
@@ -76,6 +81,14 @@ FORMS = {
     "extrinsics": "float64 4 4",
 }
 """Type and shape of each array of `States`."""
+MOVING_FORMS = FORMS | {"extrinsics": "float64 t 4 4"}
+"""The same of a camera that moves."""
+HEAD = "head"
+"""Name of the view that every data set has."""
+VIEWS = "views"
+"""Folder of other views in a data set."""
+NEW_FIELDS = ("camera",)
+"""Fields of a header that are written only if they are not their default: headers without them keep their bytes."""
 
 
 @dataclass(frozen=True)
@@ -104,15 +117,45 @@ class States:
     keypoint_visible: np.ndarray
     """[t k] bool, in the image and not hidden by an object or by another link."""
     robot_mask: np.ndarray
-    """[t h w] bool, pixels in which the head camera sees the robot."""
+    """[t h w] bool, pixels in which the camera sees the robot."""
     intrinsics: np.ndarray
-    """[3 3] float64, the head camera's K [pixels]."""
+    """[3 3] float64, the camera's K [pixels]."""
     extrinsics: np.ndarray
-    """[4 4] float64, world to camera (x right, y down, z forward)."""
+    """[4 4] float64, world to camera (x right, y down, z forward), or [t 4 4] of a camera that moves with the robot."""
 
     @property
     def frame_count(self) -> int:
         return len(self.action)
+
+
+@dataclass(frozen=True)
+class CameraSpec:
+    """A camera as data: what it is fixed to, where it looks, and its picture. The default is the head camera."""
+
+    name: str = HEAD
+    fixed_to: str = "world"
+    """world, left_tool or right_tool (the tool's frame, x out of the hand), or a link of the robot, such as left/link6."""
+    position: tuple[float, float, float] = (-0.032, -0.45, 1.35)
+    """Center of projection [m], in the frame of what it is fixed to."""
+    target: tuple[float, float, float] = (-0.032, 0.15, 0.55)
+    """Point in the middle of the picture [m], in the same frame."""
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    """Direction that points up in the picture, in the same frame."""
+    vertical_fov: float = 37.0
+    """Full vertical angle of view [deg]."""
+    size: tuple[int, int] = (WIDTH, HEIGHT)
+    """Width and height of the picture [pixels]."""
+
+    @property
+    def view(self) -> str:
+        """Name of the camera's view in a data set: the camera's name, with the size if that is not 320x240."""
+        width, height = self.size
+        return self.name if self.size == (WIDTH, HEIGHT) else f"{self.name}_{width}x{height}"
+
+    @property
+    def moves(self) -> bool:
+        """Whether the camera moves with the robot."""
+        return self.fixed_to != "world"
 
 
 @dataclass(frozen=True)
@@ -149,6 +192,8 @@ class Record:
     """Kind of motion, one of `xew.protocol.MOTIONS`."""
     files: dict[str, str] = field(default_factory=dict)
     """SHA-256 of the files as they were written, by name. The decoded bytes of such a file need not be compared."""
+    camera: CameraSpec = CameraSpec()
+    """The camera, with the place that it has on this robot."""
 
 
 def episode_folder(data: Path, task: str, seed: int, robot: str) -> Path:
@@ -176,6 +221,56 @@ def _folder_names(task: str, seed: int, robot: str) -> tuple[str, str, str]:
 def data_folder(episode: Path) -> Path:
     """The root of the data set of an episode's folder."""
     return episode.absolute().parents[2]
+
+
+def check_camera(spec: CameraSpec) -> None:
+    """Raise EpisodeError for a camera with an invalid name, or with numbers that make no picture."""
+    check_name(spec.name, "name of a camera")
+    line, up = np.subtract(spec.target, spec.position), np.array(spec.up)
+    numbers = np.array([*spec.position, *spec.target, *spec.up, spec.vertical_fov])
+    if not np.isfinite(numbers).all() or not 1 <= spec.vertical_fov <= 170:
+        raise EpisodeError(
+            f"the camera {spec.name} has a field of view of {spec.vertical_fov:g} degrees at {spec.position}; expected 1 to "
+            "170 degrees and finite numbers."
+        )
+    if np.linalg.norm(np.cross(line, up)) < 1e-6 * max(np.linalg.norm(line) * np.linalg.norm(up), 1e-6):
+        raise EpisodeError(
+            f"the camera {spec.name} at {spec.position} looks at {spec.target} with {spec.up} upward; choose a target away "
+            "from its position, and an up that is not along its line of sight."
+        )
+    if min(spec.size) < 1 or max(spec.size) > LARGEST_SIDE:
+        raise EpisodeError(
+            f"the camera {spec.name} has a picture of {spec.size[0]}x{spec.size[1]} pixels; expected at most {LARGEST_SIDE}."
+        )
+
+
+def view_folder(data: Path, view: str) -> Path:
+    """The root of a view's data set: of `head` the data set itself.
+
+    Raises:
+        EpisodeError: the data set has no such view.
+    """
+    if view == HEAD:
+        return Path(data)
+    folder = Path(data) / VIEWS / folder_name(check_name(view, "view"))
+    if not folder.is_dir():
+        known = ", ".join([HEAD, *list_views(data)])
+        raise EpisodeError(
+            f"{data} has no view {view!r}, but {known}; add it by `python -m xew.sim_warp.inspect {data} --render --cameras "
+            "NAME [--size 640x480]`."
+        )
+    return folder
+
+
+def list_views(data: Path) -> list[str]:
+    """Names of a data set's views besides `head`, sorted."""
+    return sorted(folder.name for folder in Path(data, VIEWS).glob("[!.]*") if folder.is_dir())
+
+
+def base_data(data: Path) -> Path:
+    """The data set that a view belongs to; of other data sets the data set itself."""
+    root = Path(data).absolute()
+    return root.parents[1] if root.parent.name == VIEWS else Path(data)
 
 
 def array_hash(*arrays: np.ndarray) -> str:
@@ -223,12 +318,19 @@ def write_episode(
                     if videos:
                         write_video(temporary / f"{name}.mkv", video, record.frame_rate)
             written = {path.name: file_digest(path) for path in sorted(temporary.iterdir())}
-            header = asdict(record) | {"hashes": hashes, "files": written, "videos": videos}
+            header = _plain_header(replace(record, hashes=hashes, files=written, videos=videos))
             (temporary / "episode.json").write_text(json.dumps(header, indent=1) + "\n", encoding="utf-8")
     except OSError as error:
         reason = error.strerror or error  # without the temporary name
         raise EpisodeError(f"cannot write the episode {folder}: {reason}. Free some space or choose another --out.") from error
     return folder
+
+
+def _plain_header(record: Record) -> dict[str, Any]:
+    """The content of episode.json."""
+    defaults = {f.name: f.default for f in fields(Record) if f.name in NEW_FIELDS}
+    unchanged = {name for name, value in defaults.items() if getattr(record, name) == value}
+    return {name: value for name, value in asdict(record).items() if name not in unchanged}
 
 
 @contextmanager
@@ -306,6 +408,7 @@ def _check_record(record: Record) -> Record:
         _folder_names(record.task, record.seed, record.robot)
         for name in (*record.object_names, *record.keypoint_names):
             check_label(name, "name of an object or keypoint")
+        check_camera(record.camera)
     except EpisodeError as error:
         raise ValueError(str(error).rstrip(".")) from error
     if record.motion not in MOTIONS:
@@ -356,7 +459,7 @@ def read_states(folder: Path, record: Record | None = None) -> States:
 
 def _check_states(states: States, record: Record) -> None:
     """Raise ValueError unless the arrays have their types, shapes and, where they are known, finite numbers."""
-    sizes = check_forms(vars(states), FORMS)
+    sizes = check_forms(vars(states), MOVING_FORMS if record.camera.moves else FORMS)
     counts = {"t": record.frame_count, "o": len(record.object_names), "k": len(record.keypoint_names)}
     for letter, what in (("t", "frames"), ("o", "objects"), ("k", "keypoints")):
         if sizes[letter] != counts[letter]:
@@ -411,20 +514,21 @@ def _compare(file: LoadedFile, name: str, record: Record, found: str) -> None:
 
 
 def project(points: np.ndarray, intrinsics: np.ndarray, extrinsics: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Project world points by the pinhole camera of all episodes, without distortion or skew.
+    """Project world points by a pinhole camera without distortion or skew.
 
     Pixels: x right, y down, (0, 0) is the center of the upper left pixel. Camera frame: x right, y down, z forward.
 
     Args:
-        points: [... 3] m, world frame.
+        points: [... 3] m, world frame; [t n 3] for a camera that moves.
         intrinsics: [3 3] K [pixels].
-        extrinsics: [4 4] world to camera [m].
+        extrinsics: [4 4] world to camera [m], or [t 4 4] of a camera that moves.
 
     Returns:
         Pixels [... 2] and depths along the optical axis [...] m, both float64 if an argument is. Pixels of points at or behind
         the camera (depth <= 0) are NaN.
     """
-    in_camera = points @ extrinsics[:3, :3].T + extrinsics[:3, 3]
+    offset = extrinsics[:3, 3] if extrinsics.ndim == 2 else extrinsics[:, None, :3, 3]
+    in_camera = points @ extrinsics[..., :3, :3].swapaxes(-1, -2) + offset
     depth = in_camera[..., 2]
     focal = intrinsics[[0, 1], [0, 1]]
     front = np.where(depth > 0, depth, np.nan)
