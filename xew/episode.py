@@ -8,7 +8,7 @@ An episode is a folder `<data>/<task>/<seed>/<robot>/`:
 Folders appear under their final name only when complete. A rejected cell has only its episode.json.
 
 Another camera's view of the data is a data set of the same form below it, `<data>/views/<view>/<task>/<seed>/<robot>/`
-(`view_folder`). Its states are the episode's, with that camera's keypoints, mask and matrices.
+(`xew.dataset.view_folder`). Its states are the episode's, with that camera's keypoints, mask and matrices.
 
 Shape letters, here and everywhere: t frames, h w c image, j joints, a action, o objects, k keypoints, n worlds, b batch.
 Quaternions are x y z w; the world frame has its origin under the table's center, x right, y away from the robot, z up.
@@ -38,10 +38,10 @@ from xew.config import ConfigError, parse
 from xew.files import LoadedFile, check_place, file_digest, load_file, read_json, sweep
 from xew.names import EpisodeError as EpisodeError
 from xew.names import check_label, check_name, folder_name, name_of_folder, path_below
-from xew.protocol import FRAME_RATE, MOTIONS, SHARED_MOTION
+from xew.protocol import CAMERA_SIZE, FRAME_RATE, HEAD_SPEC, MOTIONS, SHARED_MOTION, CameraSpec
 
 SCHEMA_VERSION = 2
-WIDTH, HEIGHT = 320, 240
+WIDTH, HEIGHT = CAMERA_SIZE
 FAILURES = ("plan", "grasp", "slip", "timeout", "physics", "overflow")
 """plan: no joint path. grasp: never held. slip: held and lost. timeout: the plan ended without success.
 physics: an object sank into something, fell off the table or slid in a hand. overflow: a physics buffer was too small."""
@@ -61,8 +61,6 @@ UNPACKED_BYTES, UNPACKED_RATIO = 2**27, 100
 """Largest size of the unpacked arrays of an .npz: a number of bytes, and this many times the size of the file."""
 MOST_PIXELS = 4096 * 4096
 """Largest number of pixels of a frame of an episode's video."""
-LARGEST_SIDE = 4096
-"""Largest width and height of a camera's picture [pixels]."""
 PROBED_STREAMS = 8
 """Number of streams of a container to which MOST_PIXELS applies while it is opened."""
 FORMS = {
@@ -83,10 +81,6 @@ FORMS = {
 """Type and shape of each array of `States`."""
 MOVING_FORMS = FORMS | {"extrinsics": "float64 t 4 4"}
 """The same of a camera that moves."""
-HEAD = "head"
-"""Name of the view that every data set has."""
-VIEWS = "views"
-"""Folder of other views in a data set."""
 NEW_FIELDS = ("camera",)
 """Fields of a header that are written only if they are not their default: headers without them keep their bytes."""
 
@@ -129,36 +123,6 @@ class States:
 
 
 @dataclass(frozen=True)
-class CameraSpec:
-    """A camera as data: what it is fixed to, where it looks, and its picture. The default is the head camera."""
-
-    name: str = HEAD
-    fixed_to: str = "world"
-    """world, left_tool or right_tool (the tool's frame, x out of the hand), or a link of the robot, such as left/link6."""
-    position: tuple[float, float, float] = (-0.032, -0.45, 1.35)
-    """Center of projection [m], in the frame of what it is fixed to."""
-    target: tuple[float, float, float] = (-0.032, 0.15, 0.55)
-    """Point in the middle of the picture [m], in the same frame."""
-    up: tuple[float, float, float] = (0.0, 0.0, 1.0)
-    """Direction that points up in the picture, in the same frame."""
-    vertical_fov: float = 37.0
-    """Full vertical angle of view [deg]."""
-    size: tuple[int, int] = (WIDTH, HEIGHT)
-    """Width and height of the picture [pixels]."""
-
-    @property
-    def view(self) -> str:
-        """Name of the camera's view in a data set: the camera's name, with the size if that is not 320x240."""
-        width, height = self.size
-        return self.name if self.size == (WIDTH, HEIGHT) else f"{self.name}_{width}x{height}"
-
-    @property
-    def moves(self) -> bool:
-        """Whether the camera moves with the robot."""
-        return self.fixed_to != "world"
-
-
-@dataclass(frozen=True)
 class Record:
     """episode.json: the header of one (task, seed, robot) cell."""
 
@@ -192,7 +156,7 @@ class Record:
     """Kind of motion, one of `xew.protocol.MOTIONS`."""
     files: dict[str, str] = field(default_factory=dict)
     """SHA-256 of the files as they were written, by name. The decoded bytes of such a file need not be compared."""
-    camera: CameraSpec = CameraSpec()
+    camera: CameraSpec = HEAD_SPEC
     """The camera, with the place that it has on this robot."""
 
 
@@ -221,56 +185,6 @@ def _folder_names(task: str, seed: int, robot: str) -> tuple[str, str, str]:
 def data_folder(episode: Path) -> Path:
     """The root of the data set of an episode's folder."""
     return episode.absolute().parents[2]
-
-
-def check_camera(spec: CameraSpec) -> None:
-    """Raise EpisodeError for a camera with an invalid name, or with numbers that make no picture."""
-    check_name(spec.name, "name of a camera")
-    line, up = np.subtract(spec.target, spec.position), np.array(spec.up)
-    numbers = np.array([*spec.position, *spec.target, *spec.up, spec.vertical_fov])
-    if not np.isfinite(numbers).all() or not 1 <= spec.vertical_fov <= 170:
-        raise EpisodeError(
-            f"the camera {spec.name} has a field of view of {spec.vertical_fov:g} degrees at {spec.position}; expected 1 to "
-            "170 degrees and finite numbers."
-        )
-    if np.linalg.norm(np.cross(line, up)) < 1e-6 * max(np.linalg.norm(line) * np.linalg.norm(up), 1e-6):
-        raise EpisodeError(
-            f"the camera {spec.name} at {spec.position} looks at {spec.target} with {spec.up} upward; choose a target away "
-            "from its position, and an up that is not along its line of sight."
-        )
-    if min(spec.size) < 1 or max(spec.size) > LARGEST_SIDE:
-        raise EpisodeError(
-            f"the camera {spec.name} has a picture of {spec.size[0]}x{spec.size[1]} pixels; expected at most {LARGEST_SIDE}."
-        )
-
-
-def view_folder(data: Path, view: str) -> Path:
-    """The root of a view's data set: of `head` the data set itself.
-
-    Raises:
-        EpisodeError: the data set has no such view.
-    """
-    if view == HEAD:
-        return Path(data)
-    folder = Path(data) / VIEWS / folder_name(check_name(view, "view"))
-    if not folder.is_dir():
-        known = ", ".join([HEAD, *list_views(data)])
-        raise EpisodeError(
-            f"{data} has no view {view!r}, but {known}; add it by `python -m xew.sim_warp.inspect {data} --render --cameras "
-            "NAME [--size 640x480]`."
-        )
-    return folder
-
-
-def list_views(data: Path) -> list[str]:
-    """Names of a data set's views besides `head`, sorted."""
-    return sorted(folder.name for folder in Path(data, VIEWS).glob("[!.]*") if folder.is_dir())
-
-
-def base_data(data: Path) -> Path:
-    """The data set that a view belongs to; of other data sets the data set itself."""
-    root = Path(data).absolute()
-    return root.parents[1] if root.parent.name == VIEWS else Path(data)
 
 
 def array_hash(*arrays: np.ndarray) -> str:
@@ -408,9 +322,11 @@ def _check_record(record: Record) -> Record:
         _folder_names(record.task, record.seed, record.robot)
         for name in (*record.object_names, *record.keypoint_names):
             check_label(name, "name of an object or keypoint")
-        check_camera(record.camera)
+        check_name(record.camera.name, "name of a camera")
     except EpisodeError as error:
         raise ValueError(str(error).rstrip(".")) from error
+    if record.camera.problem:
+        raise ValueError(record.camera.problem)
     if record.motion not in MOTIONS:
         raise ValueError(f"its motion is {record.motion!r}, expected {' or '.join(MOTIONS)}")
     if not SLOWEST <= record.frame_rate <= FASTEST or record.frame_count < 0:

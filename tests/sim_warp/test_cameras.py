@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from xew.config import ConfigError
-from xew.episode import CameraSpec, project
+from xew.episode import project
+from xew.protocol import CameraSpec
 from xew.sim_warp.cameras import CAMERAS, demand_sight, fix_camera, get_camera, parse_size, place_camera
 from xew.sim_warp.geometry.camera import HEAD_CAMERA
 from xew.sim_warp.geometry.poses import matrix_from_pose

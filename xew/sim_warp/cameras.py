@@ -11,7 +11,8 @@ from functools import cache
 import numpy as np
 
 from xew.config import ConfigError, load, suggestion
-from xew.episode import HEAD, LARGEST_SIDE, CameraSpec, EpisodeError, check_camera
+from xew.names import EpisodeError, check_name
+from xew.protocol import HEAD, HEAD_SPEC, LARGEST_SIDE, CameraSpec
 from xew.sim_warp.embodiment.spec import RobotSpec
 from xew.sim_warp.geometry.camera import Camera, spec_camera
 from xew.sim_warp.geometry.poses import matrix_from_pose
@@ -26,7 +27,7 @@ WRIST_CLEARANCE = 0.02
 HAND_REACH, HAND_WIDTH = (-0.06, 0.06), 0.1
 """Part of the hand below a wrist camera: range of x, and width in y [m, tool frame]."""
 CAMERAS: dict[str, CameraSpec] = {
-    HEAD: CameraSpec(),
+    HEAD: HEAD_SPEC,
     "wrist_left": replace(WRIST, name="wrist_left"),
     "wrist_right": replace(WRIST, name="wrist_right", fixed_to="right_tool"),
     "front": CameraSpec("front", position=(0.0, 0.37, 1.35), target=(0.0, -0.3, 0.95), vertical_fov=65.0),
@@ -57,10 +58,12 @@ def get_camera(name: str, size: str | None = None) -> CameraSpec:
         raise ConfigError(f"{name}: the camera has the name {spec.name!r} of a built-in camera; give it its own name.")
     spec = spec if size is None else replace(spec, size=parse_size(size))
     try:
-        check_camera(spec)
-        parse_size("{}x{}".format(*spec.size))
+        check_name(spec.name, "name of a camera")
     except EpisodeError as error:
         raise ConfigError(str(error)) from error
+    if spec.problem:
+        raise ConfigError(f"{name}: {spec.problem}.")
+    parse_size("{}x{}".format(*spec.size))
     return spec
 
 

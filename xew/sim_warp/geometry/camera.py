@@ -6,7 +6,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from xew import episode
-from xew.episode import HEIGHT, WIDTH, CameraSpec
+from xew.episode import HEIGHT, WIDTH
+from xew.protocol import HEAD_SPEC, CameraSpec
 
 
 @dataclass(frozen=True)
@@ -74,5 +75,5 @@ def spec_camera(spec: CameraSpec) -> Camera:
     return look_at(spec.position, spec.target, spec.up, spec.vertical_fov, *spec.size)
 
 
-HEAD_CAMERA = spec_camera(CameraSpec())
+HEAD_CAMERA = spec_camera(HEAD_SPEC)
 """RoboTwin's head camera: fixed above the table, 53 degrees down, vertical field of view 37 degrees."""
