@@ -13,13 +13,16 @@ from functools import cached_property
 from pathlib import Path
 
 from xew.episode import TEMPORARY, EpisodeError, Record, exact_rate, read_record
-from xew.protocol import MOTIONS, RANDOM_CHANGE, seed_split
+from xew.names import check_name, folder_name
+from xew.protocol import HEAD, MOTIONS, RANDOM_CHANGE, seed_split
 
 Episode = tuple[Path, Record]
 """Folder and header of one cell."""
 Signature = tuple[int, int, int, int]
 """Inode, size, time of change and of status change [ns] of a header's file."""
 
+VIEWS = "views"
+"""Folder of the views besides `head` in a data set."""
 UNSETTLED_NS = 100_000_000
 """Age [ns] below which a header is read again next time: two writes within one clock tick have equal time stamps."""
 
@@ -179,6 +182,35 @@ def count_motions(records: Iterable[Record]) -> dict[str, int]:
 
 def _list_motions(counts: dict[str, int]) -> str:
     return "episodes " + " and ".join(f"of {motion} motion ({count})" for motion, count in counts.items())
+
+
+def view_folder(data: Path, view: str) -> Path:
+    """The root of a view's data set: of `head` the data set itself.
+
+    Raises:
+        EpisodeError: the data set has no such view.
+    """
+    if view == HEAD:
+        return Path(data)
+    folder = Path(data) / VIEWS / folder_name(check_name(view, "view"))
+    if not folder.is_dir():
+        known = ", ".join([HEAD, *list_views(data)])
+        raise EpisodeError(
+            f"{data} has no view {view!r}, but {known}; add it by `python -m xew.sim_warp.inspect {data} --render --cameras "
+            "NAME [--size 640x480]`."
+        )
+    return folder
+
+
+def list_views(data: Path) -> list[str]:
+    """Names of a data set's views besides `head`, sorted."""
+    return sorted(folder.name for folder in Path(data, VIEWS).glob("[!.]*") if folder.is_dir())
+
+
+def base_data(data: Path) -> Path:
+    """The data set that a view's data set lies in; another data set is its own."""
+    root = Path(data).absolute()
+    return root.parents[1] if root.parent.name == VIEWS else Path(data)
 
 
 def explain_missing(data: Path, what: str = "episode") -> EpisodeError:

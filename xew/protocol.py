@@ -1,8 +1,9 @@
-"""The protocol of a study as plain data: roles of robots, splits, seeds, variants, counts, and the layout of a command.
+"""The protocol of a study as plain data: roles of robots, splits, seeds, counts, commands and cameras.
 
 It follows the paper's section 3 and its appendix. Every package may import this file, which imports nothing of xew.
 """
 
+import math
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -31,6 +32,63 @@ DIMENSION_TITLES = {
     "objects": "Object dynamics",
 }
 """Titles of the dimensions, the groups of metrics, which are never combined into one number."""
+
+CAMERA_SIZE = (320, 240)
+"""Width and height of the head camera's picture [pixels]."""
+LARGEST_SIDE = 4096
+"""Largest width and height of a camera's picture [pixels]."""
+HEAD = "head"
+"""Name of the camera, and of its view, that every data set has."""
+
+
+@dataclass(frozen=True)
+class CameraSpec:
+    """A camera as data: what it is fixed to, where it looks, and its picture. The default is the head camera."""
+
+    name: str = HEAD
+    fixed_to: str = "world"
+    """world, left_tool or right_tool (the tool's frame, x out of the hand), or a link of the robot, such as left/link6."""
+    position: tuple[float, float, float] = (-0.032, -0.45, 1.35)
+    """Center of projection [m], in the frame of what it is fixed to."""
+    target: tuple[float, float, float] = (-0.032, 0.15, 0.55)
+    """Point in the middle of the picture [m], in the same frame."""
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    """Direction that points up in the picture, in the same frame."""
+    vertical_fov: float = 37.0
+    """Full vertical angle of view [deg]."""
+    size: tuple[int, int] = CAMERA_SIZE
+    """Width and height of the picture [pixels]."""
+
+    @property
+    def view(self) -> str:
+        """Name of the camera's view in a data set: the camera's name, with the size if that is not 320x240."""
+        width, height = self.size
+        return self.name if self.size == CAMERA_SIZE else f"{self.name}_{width}x{height}"
+
+    @property
+    def moves(self) -> bool:
+        """Whether the camera moves with the robot."""
+        return self.fixed_to != "world"
+
+    @property
+    def problem(self) -> str:
+        """Reason why the numbers make no picture; empty if they do."""
+        line = [to - start for start, to in zip(self.position, self.target, strict=True)]
+        (a, b, c), (x, y, z) = line, self.up
+        sideways = math.hypot(b * z - c * y, c * x - a * z, a * y - b * x)
+        if not all(map(math.isfinite, (sideways, self.vertical_fov))) or not 1 <= self.vertical_fov <= 170:
+            return f"the camera has a field of view of {self.vertical_fov:g} degrees; expected 1 to 170, and finite numbers"
+        if sideways < 1e-6:
+            return (
+                f"the camera at {self.position} looks at {self.target} with {self.up} upward; choose a target away from its "
+                "position, and an up across the line of sight"
+            )
+        if not 1 <= min(self.size) <= max(self.size) <= LARGEST_SIDE:
+            return f"the camera has a picture of {self.size} pixels, expected sides of 1 to {LARGEST_SIDE}"
+        return ""
+
+
+HEAD_SPEC = CameraSpec()
 
 SHARED_MOTION, OWN_MOTION = "shared", "own"
 MOTIONS = (SHARED_MOTION, OWN_MOTION)

@@ -8,17 +8,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from tests.sim_warp.small import CLOSE, TASK, produce
 from xew.dataset import demand_one_change
 from xew.episode import EpisodeError, Record, States, array_hash, episode_folder, read_record, read_states
-from xew.protocol import FACTORS, SHARED_MOTION, Change, parse_change, split_key
+from xew.protocol import FACTORS, HEAD_SPEC, SHARED_MOTION, Change, parse_change, split_key
 from xew.sim_warp import generate
 from xew.sim_warp.changes import patterns
 from xew.sim_warp.changes.clutter import AREA, find_struck
 from xew.sim_warp.changes.looks import camera_of, stage_of
 from xew.sim_warp.changes.scenes import change_of, demand_change, make_plan, make_scene, raised_by
-from xew.sim_warp.geometry.camera import HEAD_CAMERA
+from xew.sim_warp.geometry.camera import HEAD_CAMERA, spec_camera
 from xew.sim_warp.inspect import main as inspect
 from xew.sim_warp.inspection.checks import find_problem
 from xew.sim_warp.physics import World, simulate
@@ -101,7 +102,7 @@ def test_levels_grow_and_stay_in_view(factor: str, renderer: Renderer) -> None:
         scene = make_scene(CLOSE, TASK, 0, str(change or ""))
         pose = np.array([thing.pose for thing in scene.objects])[None]
         seen = scene_recording(ROBOTS["piper"], scene, stand_at_home(ROBOTS["piper"], 1), pose, np.zeros((1, 1)))
-        view = observe(renderer, [seen], camera_of(change), stage_of(change))[0]
+        view = observe(renderer, [seen], spec_camera(camera_of(change)), stage_of(change))[0]
         assert view.robot_mask.mean() > 0.02
         pictures.append(view.rgb.astype(float))
     differences = [np.abs(picture - pictures[0]).mean() for picture in pictures]
@@ -221,9 +222,19 @@ def test_random_changes_are_a_function_of_the_scene_and_never_graded() -> None:
     demand_change(Path("here"), record, "random")
 
 
+@pytest.mark.parametrize("level", [1, 2, 3, 5])
+def test_a_changed_camera_is_turned_and_moved_by_its_strength(level: int) -> None:
+    change = Change("camera", level)
+    camera = spec_camera(camera_of(change))
+    offset = camera.extrinsics @ np.linalg.inv(HEAD_CAMERA.extrinsics)
+    assert np.degrees(Rotation.from_matrix(offset[:3, :3]).magnitude()) == pytest.approx(1.5 * change.strength, abs=1e-3)
+    assert np.linalg.norm(camera.position - HEAD_CAMERA.position) == pytest.approx(0.015 * change.strength, abs=1e-5)
+    assert np.array_equal(camera.intrinsics, HEAD_CAMERA.intrinsics) and camera_of(change).problem == ""
+
+
 def test_level_0_changes_nothing_and_names_say_the_change() -> None:
     assert parse_change("light:0") is parse_change("") is None and change_of("light:00", TASK, 0) == ""
-    assert camera_of(None) is camera_of(Change("light", 1)) is HEAD_CAMERA
+    assert camera_of(None) is camera_of(Change("light", 1)) is HEAD_SPEC
     assert str(parse_change("light:04")) == "light:4"
     assert [split_key("data", SHARED_MOTION, change) for change in ("", "light:2", "random")] == [
         "data",

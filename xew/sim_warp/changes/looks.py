@@ -6,11 +6,11 @@ from functools import lru_cache
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from xew.protocol import STRENGTHS, Change
+from xew.protocol import HEAD_SPEC, STRENGTHS, CameraSpec, Change
 from xew.sim_warp import stage
 from xew.sim_warp.changes import patterns
 from xew.sim_warp.changes.scenes import change_rng, raised_by
-from xew.sim_warp.geometry.camera import HEAD_CAMERA, Camera
+from xew.sim_warp.geometry.camera import spec_camera
 from xew.sim_warp.geometry.meshes import Color
 from xew.sim_warp.stage import STANDARD, Light, Pattern, Stage
 
@@ -60,16 +60,17 @@ def stage_of(change: Change | None) -> Stage:
     return makers[change.factor](change) if change and change.factor in makers else STANDARD
 
 
-def camera_of(change: Change | None, camera: Camera = HEAD_CAMERA) -> Camera:
+def camera_of(change: Change | None, spec: CameraSpec = HEAD_SPEC) -> CameraSpec:
     """The camera of a changed scene, turned and moved in its own frame; the same camera if the change is another."""
     if change is None or change.factor != "camera":
-        return camera
-    rng = change_rng(change)
-    turn, shift = (vector / np.linalg.norm(vector) for vector in rng.uniform(-1, 1, (2, 3)))
-    offset = np.eye(4)
-    offset[:3, :3] = Rotation.from_rotvec(change.strength * np.radians(CAMERA_TURN) * turn).as_matrix()
-    offset[:3, 3] = change.strength * CAMERA_SHIFT * shift
-    return replace(camera, extrinsics=offset @ camera.extrinsics)
+        return spec
+    turn, shift = (vector / np.linalg.norm(vector) for vector in change_rng(change).uniform(-1, 1, (2, 3)))
+    axes = spec_camera(spec).extrinsics[:3, :3]
+    turned = Rotation.from_rotvec(change.strength * np.radians(CAMERA_TURN) * turn).as_matrix() @ axes
+    position = spec.position + change.strength * CAMERA_SHIFT * shift @ axes
+    distance = np.linalg.norm(np.subtract(spec.target, spec.position))
+    place = {"position": position, "target": position + distance * turned[2], "up": -turned[1]}
+    return replace(spec, **{name: _plain(vector.round(6)) for name, vector in place.items()})
 
 
 def _relight(change: Change) -> Stage:

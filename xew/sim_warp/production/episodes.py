@@ -13,6 +13,7 @@ from xew.config import ConfigError
 from xew.episode import Record, States, read_record, write_episode
 from xew.protocol import parse_change
 from xew.sim_warp.changes.looks import camera_of, stage_of
+from xew.sim_warp.geometry.camera import spec_camera
 from xew.sim_warp.production.cells import Cell
 from xew.sim_warp.rendering.observe import Observation, keypoint_names, observe
 from xew.sim_warp.rendering.render import Renderer
@@ -27,7 +28,7 @@ Pixels = tuple[Observation, np.ndarray]
 def render_cells(cells: Sequence[Cell], renderer: Renderer) -> list[Pixels]:
     """The camera's observation of each cell of a scene, and the robot alone by its commands [t h w 3] uint8."""
     change = parse_change(cells[0].change)
-    camera = camera_of(change)
+    camera = spec_camera(camera_of(change))
     views = observe(renderer, [cell.recording for cell in cells], camera, stage_of(change))
     renders = command_renders([(cell.robot, cell.commands.action) for cell in cells], camera, renderer)
     return list(zip(views, renders, strict=True))
@@ -61,6 +62,7 @@ def header(cell: Cell, device: wp.Device) -> Record:
         device=device.name,
         motion=cell.motion_kind,
         change=cell.change,
+        camera=camera_of(parse_change(cell.change)),
     )
 
 
@@ -82,7 +84,7 @@ def _versions() -> dict[str, str]:
 
 def _states(cell: Cell, view: Observation) -> States:
     assert cell.tool_pose is not None, "a cell that is rendered has been simulated"
-    camera = camera_of(parse_change(cell.change))
+    camera = spec_camera(camera_of(parse_change(cell.change)))
     return States(
         action=cell.commands.action,
         joint_pos=cell.known_motion.joint_pos,

@@ -22,6 +22,7 @@ from xew.protocol import OWN_MOTION, parse_change
 from xew.sim_warp.changes.looks import camera_of, stage_of
 from xew.sim_warp.changes.scenes import change_of, demand_change, make_plan, make_scene
 from xew.sim_warp.embodiment.spec import RobotSpec
+from xew.sim_warp.geometry.camera import spec_camera
 from xew.sim_warp.kinematics.own_motion import own_commands
 from xew.sim_warp.physics.plausibility import find_implausible
 from xew.sim_warp.production.outcome import find_obstruction
@@ -63,7 +64,7 @@ def _draw(
 ) -> tuple[States, np.ndarray, np.ndarray]:
     """The states with what the camera sees of them, and the head camera's and the robot's video [t h w 3] uint8."""
     wanted = parse_change(change)
-    camera = camera_of(wanted)
+    camera = spec_camera(camera_of(wanted))
     recording = scene_recording(robot, scene, states.joint_pos, states.object_pose, states.object_joint)
     view = observe(renderer, [recording], camera, stage_of(wanted))[0]
     seen = replace(
@@ -104,7 +105,8 @@ def render_changed(folder: Path, name: str, out: Path, renderer: Renderer) -> Re
     scene = make_scene(task, record.task, record.seed, change)
     states, rgb, render = _draw(robot, scene, read_states(folder), change, renderer)
     recording = scene_recording(robot, scene, states.joint_pos, states.object_pose, states.object_joint)
-    changed = replace(record, change=change, scene_hash=scene_hash(scene), device=renderer.device.name)
+    scene_now = {"change": change, "scene_hash": scene_hash(scene), "camera": camera_of(parse_change(change))}
+    changed = replace(record, device=renderer.device.name, **scene_now)
     if failure := find_obstruction(scene, recording):
         failed = replace(changed, success=False, failure=failure[0], failure_detail=failure[1], hashes={}, files={})
         return read_record(write_episode(out, failed))

@@ -12,8 +12,18 @@ SHADOW_SIZE = 512
 """Side of a shadow map [texels], about 3.5 mm each on the table: less than two pixels of the head camera."""
 
 
-def camera_view(camera: Camera) -> raster.View:
-    """The camera as an argument of the kernels."""
+def camera_views(camera: Camera, frames: np.ndarray) -> np.ndarray:
+    """The camera as an argument of the kernels, `raster_kernels.View` by field: [n] at frames [n] if it moves, else [1]."""
+    extrinsics = camera.extrinsics[frames] if camera.moves else camera.extrinsics[None]
+    views = np.zeros(len(extrinsics), raster.View.numpy_dtype())
+    views["rotation"], views["translation"] = extrinsics[:, :3, :3], extrinsics[:, :3, 3]
+    views["focal"], views["center"] = camera.intrinsics[[0, 1], [0, 1]], camera.intrinsics[:2, 2]
+    views["near"] = raster.NEAR_OF_MOVING if camera.moves else raster.NEAR
+    return views
+
+
+def light_view(camera: Camera) -> raster.View:
+    """The view of a light's shadow map."""
     view = raster.View()
     view.rotation = wp.mat33(*camera.extrinsics[:3, :3].ravel())
     view.translation = wp.vec3(*camera.extrinsics[:3, 3])
@@ -34,7 +44,7 @@ def light_of(source: stage.Light) -> raster.Light:
         position = np.array(source.position)
     light.position = wp.vec3(*position)
     camera = look_at(position, position + direction, (0.0, 1.0, 0.0), stage.SHADOW_ANGLE, SHADOW_SIZE, SHADOW_SIZE)
-    light.view = camera_view(camera)
+    light.view = light_view(camera)
     if source.position is None:
         light.view.parallel = 1
         light.view.focal = wp.vec2(SHADOW_SIZE / stage.SHADOW_WIDTH, SHADOW_SIZE / stage.SHADOW_WIDTH)

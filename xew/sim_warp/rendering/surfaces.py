@@ -198,7 +198,7 @@ def _tracks(view: _View, thing_names: Sequence[str], placed: _Placed) -> Surface
 def _see(camera: Camera, placed: _Placed, body: np.ndarray, depth: np.ndarray, least_facing: float) -> _Seen:
     """Points in the image; visible are those that face the camera where the buffer has their body and depth, both [t p]."""
     pixels, own_depth = project(camera, placed.xyz)
-    to_camera = camera.position - placed.xyz
+    to_camera = camera.position[..., None, :] - placed.xyz
     facing = np.einsum("tpi,tpi->tp", placed.normal, to_camera) > least_facing * np.linalg.norm(to_camera, axis=-1)
     near = (own_depth > 0) & (np.abs(depth - own_depth) < DEPTH_MARGIN)
     return _Seen(pixels, (body == placed.body) & facing & near, placed.body)
