@@ -96,7 +96,7 @@ MOTIONS = (SHARED_MOTION, OWN_MOTION)
 moves between the task's waypoints on its own path, in its own time and from its own rest posture."""
 
 FACTORS = ("light", "background", "table", "clutter", "height", "camera")
-"""What one change of a scene may concern; everything else stays as it is."""
+"""Factors of a scene, of which a change concerns one; everything else stays the same."""
 STRENGTHS = 3
 """Number of strengths of a change, each stronger than the previous one."""
 MOST_LEVEL = 99

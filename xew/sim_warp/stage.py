@@ -71,7 +71,7 @@ class Pattern:
     """A periodic image on the horizontal or vertical faces of one part of the stage."""
 
     image: np.ndarray
-    """[m m 3] uint8, sRGB; its columns run along x, or along y on faces that face x."""
+    """[p p 3] uint8, sRGB; its columns run along x, or along y on faces that face x."""
     period: float
     """Side of the image on the surface [m]."""
 

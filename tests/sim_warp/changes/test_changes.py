@@ -22,7 +22,8 @@ from xew.sim_warp.changes.scenes import change_of, demand_change, make_plan, mak
 from xew.sim_warp.geometry.camera import HEAD_CAMERA, spec_camera
 from xew.sim_warp.inspect import main as inspect
 from xew.sim_warp.inspection.checks import find_problem
-from xew.sim_warp.physics import World, simulate
+from xew.sim_warp.physics import Motion, World, simulate
+from xew.sim_warp.physics.gpu import simulate_batch
 from xew.sim_warp.production.cells import Job
 from xew.sim_warp.production.rerender import render_changed
 from xew.sim_warp.production.surfaces import read_surfaces
@@ -73,7 +74,7 @@ def test_a_change_of_the_view_leaves_states_and_commands_to_the_byte(factor: str
         assert find_problem(after) == ""
 
 
-def test_a_raised_table_is_planned_and_simulated_again(data: Callable[[str], Path]) -> None:
+def test_another_height_is_planned_and_simulated_again(data: Callable[[str], Path]) -> None:
     old, new = (read_states(episode_folder(data(change), TASK, 0, "piper")) for change in ("", "height:1"))
     height = raised_by(Change("height", 1))
     assert np.allclose(new.object_pose - old.object_pose, [0, 0, height, 0, 0, 0, 0], atol=1e-4)
@@ -252,3 +253,11 @@ def test_patterns_are_periodic_and_the_same_on_every_machine() -> None:
     assert array_hash(*drawn)[:16] == "7b095d1ee043d0fe"
     rows = patterns.noise(np.random.Generator(np.random.Philox(key=1)), 8, 8)
     assert np.abs(np.diff(rows, axis=0, append=rows[:1])).max() < 0.1
+
+
+@pytest.mark.parametrize("step", [simulate, simulate_batch], ids=["one by one", "in a batch"])
+def test_objects_stand_on_a_raised_table_in_both_engines(step: Callable[..., list[Motion]]) -> None:
+    robot, scenes = ROBOTS["piper"], [make_scene(CLOSE, TASK, 0, change) for change in ("", "height:3")]
+    flat, raised = step([World(robot, scene, stand_at_home(robot, 6)) for scene in scenes], "cpu")
+    assert np.allclose(raised.object_pose[..., 2] - flat.object_pose[..., 2], raised_by(Change("height", 3)), atol=2e-4)
+    assert raised.object_pose[-1, 0, 2] == pytest.approx(scenes[1].objects[0].pose[2], abs=1e-3)

@@ -61,11 +61,11 @@ KINDS: tuple[Callable[[np.random.Generator, Color], Shape], ...] = (_box, _can, 
 
 
 def scatter(rng: np.random.Generator, scene: Scene, path: ToolPath, strength: int) -> tuple[SceneObject, ...]:
-    """Clutter of a scene; a weaker change has the first objects of a stronger one, fewer where there is no more space."""
+    """Clutter of a scene, in colors that its instruction does not name; a weaker change has the first objects of a stronger."""
     clutter: list[SceneObject] = []
-    colors = rng.permutation(sorted(objects.PALETTE))
+    colors = [str(color) for color in rng.permutation(sorted(objects.PALETTE)) if color not in scene.words.values()]
     for number in range(COUNTS[-1]):
-        shape = KINDS[rng.integers(len(KINDS))](rng, objects.PALETTE[str(colors[number])])
+        shape = KINDS[rng.integers(len(KINDS))](rng, objects.PALETTE[colors[number % len(colors)]])
         places, yaw = _in_view(rng.uniform(*AREA, (TRIES, 2))), rng.uniform(-np.pi, np.pi)
         free = places[_clearance(places, [*scene.objects, *clutter], path) > _radius(shape)]
         if len(free):

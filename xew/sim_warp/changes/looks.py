@@ -50,7 +50,7 @@ GROUND_PATTERNS: tuple[tuple[patterns.Draw, float], ...] = (
 LAMP_TURN = 25.0
 """Angle about the table's center by which a step of strength turns the lamps [deg]."""
 CAMERA_TURN, CAMERA_SHIFT = 1.5, 0.015
-"""Angle [deg] and distance [m] by which a step of strength turns and moves a camera."""
+"""Angle [deg] by which a step of strength turns a camera, and way that it moves as a share of the distance to its target."""
 
 
 @lru_cache(maxsize=16)
@@ -67,8 +67,8 @@ def camera_of(change: Change | None, spec: CameraSpec = HEAD_SPEC) -> CameraSpec
     turn, shift = (vector / np.linalg.norm(vector) for vector in change_rng(change).uniform(-1, 1, (2, 3)))
     axes = spec_camera(spec).extrinsics[:3, :3]
     turned = Rotation.from_rotvec(change.strength * np.radians(CAMERA_TURN) * turn).as_matrix() @ axes
-    position = spec.position + change.strength * CAMERA_SHIFT * shift @ axes
     distance = np.linalg.norm(np.subtract(spec.target, spec.position))
+    position = spec.position + change.strength * CAMERA_SHIFT * distance * shift @ axes
     place = {"position": position, "target": position + distance * turned[2], "up": -turned[1]}
     return replace(spec, **{name: _plain(vector.round(6)) for name, vector in place.items()})
 

@@ -14,12 +14,12 @@ import numpy as np
 from xew.episode import EpisodeError, Record
 from xew.protocol import FACTORS, MOST_LEVEL, RANDOM_CHANGE, STRENGTHS, Change, parse_change
 from xew.sim_warp.changes.clutter import scatter
-from xew.sim_warp.plan import HOME, Segment, Timeline, Tool
+from xew.sim_warp.plan import ASIDE, HOME, Segment, Timeline, Tool
 from xew.sim_warp.scene import Scene, SceneObject, scene_rng
 from xew.sim_warp.tasks import Moment, Task
 
-HEIGHT_STEP = 0.02
-"""Height by which a step of strength raises or lowers the table [m]."""
+HEIGHT_STEP = 0.01
+"""Height by which a step of strength lowers or raises the table [m]; RoboTwin 2.0 lowers it by up to 3 cm."""
 
 
 def change_rng(change: Change) -> np.random.Generator:
@@ -81,8 +81,8 @@ def is_solved(task: Task, scene: Scene, moment: Moment) -> bool:
 
 
 def raised_by(change: Change) -> float:
-    """Height of the table's top over the standard one [m]: lower in every second draw, beginning with the second."""
-    return (1 - 2 * (change.draw % 2)) * change.strength * HEIGHT_STEP
+    """Height of the table's top over the standard one [m]: below it, and in every second draw above it."""
+    return (2 * (change.draw % 2) - 1) * change.strength * HEIGHT_STEP
 
 
 def _raise_scene(scene: Scene, height: float) -> Scene:
@@ -99,10 +99,11 @@ def _raise_scene(scene: Scene, height: float) -> Scene:
 
 
 def _raise_plan(plan: Timeline, height: float) -> Timeline:
-    """The plan with all waypoints but home moved up by `height` [m], on the same clock."""
+    """The plan with its waypoints moved up by `height` [m], on the same clock; hands start and wait where they do."""
+    kept = (*HOME, *ASIDE)
 
     def moved(tool: Tool) -> Tool:
-        return tool if any(tool is home for home in HOME) else tool.moved(z=height)
+        return tool if any(tool is one for one in kept) else tool.moved(z=height)
 
     def moved_segments(segments: Sequence[Segment]) -> list[Segment]:
         return [replace(segment, waypoints=tuple(map(moved, segment.waypoints))) for segment in segments]
