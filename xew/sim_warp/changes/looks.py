@@ -69,8 +69,8 @@ def camera_of(change: Change | None, spec: CameraSpec = HEAD_SPEC) -> CameraSpec
     turned = Rotation.from_rotvec(change.strength * np.radians(CAMERA_TURN) * turn).as_matrix() @ axes
     distance = np.linalg.norm(np.subtract(spec.target, spec.position))
     position = spec.position + change.strength * CAMERA_SHIFT * distance * shift @ axes
-    place = {"position": position, "target": position + distance * turned[2], "up": -turned[1]}
-    return replace(spec, **{name: _plain(vector.round(6)) for name, vector in place.items()})
+    position, target, up = (_plain(vector.round(6)) for vector in (position, position + distance * turned[2], -turned[1]))
+    return replace(spec, position=position, target=target, up=up)
 
 
 def _relight(change: Change) -> Stage:

@@ -91,8 +91,7 @@ def _raise_scene(scene: Scene, height: float) -> Scene:
         return scene
 
     def moved(thing: SceneObject) -> SceneObject:
-        x, y, z, *turn = thing.pose
-        return replace(thing, pose=(x, y, z + height, *turn))
+        return replace(thing, pose=(*thing.pose[:2], thing.pose[2] + height, *thing.pose[3:]))
 
     raised = scene.raised + height
     return replace(scene, objects=tuple(map(moved, scene.objects)), raised=0.0 if abs(raised) < 1e-9 else raised)

@@ -89,8 +89,11 @@ def plan_cells(jobs: Sequence[Job], robots: Mapping[str, RobotSpec] = ROBOTS, de
         planned = plan_motion(robot, [plans[index] for index in mine], kind, device)
         for index, (path, commands) in zip(mine, planned, strict=True):
             failure = None if commands.problem is None else ("plan", commands.problem)
-            job, how = jobs[index], {"motion_kind": kind, "failure": failure}
-            seeds[index].append(Cell(job.task, scenes[index], path, name, robot, commands, change=job.change, **how))
+            job = jobs[index]
+            cell = Cell(
+                job.task, scenes[index], path, name, robot, commands, motion_kind=kind, change=job.change, failure=failure
+            )
+            seeds[index].append(cell)
     return seeds
 
 

@@ -105,8 +105,8 @@ def render_changed(folder: Path, name: str, out: Path, renderer: Renderer) -> Re
     scene = make_scene(task, record.task, record.seed, change)
     states, rgb, render = _draw(robot, scene, read_states(folder), change, renderer)
     recording = scene_recording(robot, scene, states.joint_pos, states.object_pose, states.object_joint)
-    scene_now = {"change": change, "scene_hash": scene_hash(scene), "camera": camera_of(parse_change(change))}
-    changed = replace(record, device=renderer.device.name, **scene_now)
+    camera = camera_of(parse_change(change))
+    changed = replace(record, change=change, camera=camera, scene_hash=scene_hash(scene), device=renderer.device.name)
     if failure := find_obstruction(scene, recording):
         failed = replace(changed, success=False, failure=failure[0], failure_detail=failure[1], hashes={}, files={})
         return read_record(write_episode(out, failed))
