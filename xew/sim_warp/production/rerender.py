@@ -1,22 +1,28 @@
-"""Re-rendering of episodes from recorded states, missing videos, and the plausibility check of their motion."""
+"""Re-rendering of episodes from recorded states: missing videos and other views; and the plausibility check of motion."""
 
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from xew.dataset import VIEWS
 from xew.episode import (
     EpisodeError,
     Record,
+    States,
     array_hash,
     data_folder,
     demand_known,
+    episode_folder,
     read_record,
     read_states,
     states_hash,
     write_episode,
 )
-from xew.protocol import OWN_MOTION
+from xew.names import path_below
+from xew.protocol import OWN_MOTION, CameraSpec
+from xew.sim_warp.cameras import fix_camera, place_camera
+from xew.sim_warp.embodiment.spec import RobotSpec
 from xew.sim_warp.kinematics.own_motion import own_commands
 from xew.sim_warp.physics.plausibility import find_implausible
 from xew.sim_warp.rendering.observe import observe, scene_recording
@@ -31,7 +37,7 @@ def render_again(folder: Path, renderer: Renderer) -> tuple[np.ndarray, np.ndarr
     """Render an episode's pixels, mask and keypoints again from its recorded joints, objects and commands.
 
     Returns:
-        The head camera's and the robot's video [t h w 3] uint8, whose hashes agree with the recorded ones.
+        The camera's and the robot's video [t h w 3] uint8, whose hashes agree with the recorded ones.
 
     Raises:
         EpisodeError: the scene or a hash differs from the recorded one.
@@ -39,11 +45,9 @@ def render_again(folder: Path, renderer: Renderer) -> tuple[np.ndarray, np.ndarr
     record = read_record(folder)
     robot = recorded_robot(record.robot, data_folder(folder))
     demand_known(folder, "joint_pos", "object_pose")
-    states, scene = read_states(folder), _sample_again(folder, record)
-    view = observe(renderer, [scene_recording(robot, scene, states.joint_pos, states.object_pose, states.object_joint)])[0]
-    render = command_renders([(robot, states.action)], renderer=renderer)[0]
-    again = replace(states, keypoints=view.keypoints, keypoint_visible=view.keypoint_visible, robot_mask=view.robot_mask)
-    hashes = {"states": states_hash(again), "rgb": array_hash(view.rgb), "robot": array_hash(render)}
+    states, scene = read_states(folder, record), _sample_again(folder, record)
+    again, rgb, render = _render_view(robot, scene, states, record.camera, renderer)
+    hashes = {"states": states_hash(again), "rgb": array_hash(rgb), "robot": array_hash(render)}
     hashes["scene"] = scene_hash(scene)
     for name, recorded in (record.hashes | {"scene": record.scene_hash}).items():
         if hashes[name] != recorded:
@@ -51,7 +55,59 @@ def render_again(folder: Path, renderer: Renderer) -> tuple[np.ndarray, np.ndarr
                 f"{folder}: rendered again on {renderer.device.name}, {name} has hash {hashes[name][:12]}, expected "
                 f"{recorded[:12]} as recorded on {record.device}. Use the same device and versions as for the recording."
             )
-    return view.rgb, render
+    return rgb, render
+
+
+def _render_view(
+    robot: RobotSpec, scene: Scene, states: States, spec: CameraSpec, renderer: Renderer
+) -> tuple[States, np.ndarray, np.ndarray]:
+    """The states as a camera sees them, its video and the robot's by its commands, both [t h w 3] uint8.
+
+    A camera on the robot is moved by the measured joints for the scene, and by the commanded joints for the robot alone.
+    """
+    camera = place_camera(spec, robot, states.joint_pos)
+    recording = scene_recording(robot, scene, states.joint_pos, states.object_pose, states.object_joint)
+    view = observe(renderer, [recording], camera)[0]
+    render = command_renders([(robot, states.action)], place_camera(spec, robot, states.action), renderer)[0]
+    seen = replace(
+        states,
+        keypoints=view.keypoints,
+        keypoint_visible=view.keypoint_visible,
+        robot_mask=view.robot_mask,
+        intrinsics=camera.intrinsics,
+        extrinsics=camera.extrinsics,
+    )
+    return seen, view.rgb, render
+
+
+def add_view(folder: Path, spec: CameraSpec, renderer: Renderer) -> bool:
+    """Render and write the view of a camera of an accepted episode; returns whether it was missing.
+
+    Raises:
+        EpisodeError: the episode was imported without its objects, or its task has changed.
+        ConfigError: the robot does not have the link that the camera is fixed to.
+    """
+    record = read_record(folder)
+    data = data_folder(folder)
+    robot = recorded_robot(record.robot, data)
+    demand_known(folder, "joint_pos", "object_pose", record=record)
+    fixed, states, root = fix_camera(spec, robot), read_states(folder, record), data / VIEWS / spec.view
+    if _shows(episode_folder(root, record.task, record.seed, record.robot), fixed, states):
+        return False
+    seen, rgb, render = _render_view(robot, _sample_again(folder, record), states, fixed, renderer)
+    header = replace(record, camera=fixed, device=renderer.device.name)
+    write_episode(path_below(data, VIEWS, spec.view), header, seen, rgb, render)
+    return True
+
+
+def _shows(folder: Path, spec: CameraSpec, states: States) -> bool:
+    """Whether a view is of this camera and of these states."""
+    if not (folder / "episode.json").exists():
+        return False
+    record = read_record(folder)
+    seen = read_states(folder, record)
+    same = (np.array_equal(getattr(seen, name), getattr(states, name)) for name in ("action", "joint_pos", "object_pose"))
+    return record.camera == spec and record.videos and all(same)
 
 
 def add_videos(folder: Path, renderer: Renderer) -> None:
