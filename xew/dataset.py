@@ -12,7 +12,7 @@ from fractions import Fraction
 from functools import cached_property
 from pathlib import Path
 
-from xew.episode import TEMPORARY, EpisodeError, Record, exact_rate, read_record
+from xew.episode import TEMPORARY, EpisodeError, Record, data_folder, exact_rate, read_record
 from xew.names import check_name, folder_name
 from xew.protocol import HEAD, MOTIONS, RANDOM_CHANGE, seed_split
 
@@ -202,6 +202,14 @@ def view_folder(data: Path, view: str) -> Path:
     return folder
 
 
+def view_episode(folder: Path, view: str) -> Path:
+    """The folder of an episode in a view of its data set. Raises EpisodeError if the view does not have it."""
+    seen = view_folder(data_folder(folder), view).joinpath(*folder.absolute().parts[-3:])
+    if not seen.is_dir():
+        raise EpisodeError(f"the view {view} has no episode {seen}; run `inspect DATA --render --cameras …` again to add it.")
+    return seen
+
+
 def list_views(data: Path) -> list[str]:
     """Names of a data set's views besides `head`, sorted."""
     return sorted(folder.name for folder in Path(data, VIEWS).glob("[!.]*") if folder.is_dir())
@@ -211,6 +219,13 @@ def base_data(data: Path) -> Path:
     """The data set that a view's data set lies in; another data set is its own."""
     root = Path(data).absolute()
     return root.parents[1] if root.parent.name == VIEWS else Path(data)
+
+
+def folder_beside(data: Path, name: str) -> Path:
+    """The folder for what is made of a data set, `<data>-NAME`; of a view, below that of the data set."""
+    base, data = base_data(data), Path(data)
+    folder = base.with_name(f"{base.name}-{name}")
+    return folder if base == data else folder / VIEWS / data.name
 
 
 def explain_missing(data: Path, what: str = "episode") -> EpisodeError:

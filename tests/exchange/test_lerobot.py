@@ -101,6 +101,7 @@ def test_a_red_block_stays_red(tmp_path: Path) -> None:
 
 def test_frames_of_another_size_are_refused(tmp_path: Path) -> None:
     film = lerobot._VideoFiles(tmp_path / "observation.images.head", Fraction(25))
+    film.add(np.zeros((2, 240, 320, 3), np.uint8))
     with pytest.raises(EpisodeError, match="frames of 640x480, expected 320x240"):
         film.add(np.zeros((2, 480, 640, 3), np.uint8))
 

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from tests.sim_warp.small import SLOW, TASK, WITH_SLOW, produce
+from xew.dataset import VIEWS, list_views, view_episode
 from xew.episode import States, episode_folder, read_record, read_states, read_video, write_episode
 from xew.names import folder_name
 from xew.sim_warp.inspect import main, read_headers
@@ -95,6 +96,59 @@ def test_videos_that_were_left_out_are_made_on_demand(made: Path, tmp_path: Path
         np.testing.assert_array_equal(read_video(folder / "rgb.mkv"), read_video(written / "rgb.mkv"))
     assert "2 of 2 episodes agree with their hashes" in inspect(data, "--verify")[1]
     assert "videos of 0 episodes made" in inspect(data, "--render")[1]
+
+
+def tree_bytes(root: Path) -> dict[str, bytes]:
+    """Content of all files below a folder, by path; without the views."""
+    files = (path for path in root.rglob("*") if path.is_file())
+    return {str(path.relative_to(root)): path.read_bytes() for path in files if VIEWS not in path.relative_to(root).parts}
+
+
+def test_views_are_added_and_the_head_camera_s_episodes_keep_their_bytes(data: Path, tmp_path: Path, inspect: Inspect) -> None:
+    before = tree_bytes(data)
+    code, out, _ = inspect(data, "--render", "--cameras", "head", "wrist_left", "--size", "160x120")
+    assert code == 0 and "view head_160x120: 2 of 2 episodes new\nview wrist_left_160x120: 2 of 2 episodes new" in out
+    assert tree_bytes(data) == before
+    assert b"camera" not in before[f"{folder_name(TASK)}/0000000/franka_panda/episode.json"]
+    assert list_views(data) == ["head_160x120", "wrist_left_160x120"]
+    assert "view head_160x120: 0 of 2 episodes new" in inspect(data, "--render", "--cameras", "head", "--size", "160x120")[1]
+    out = inspect(data, "--verify", "--rerender", 6)[1]
+    assert "6 of 6 episodes agree with their hashes" in out and "6 episodes rendered again" in out
+    folder = view_episode(episode_folder(data, TASK, 0, "franka_panda"), "wrist_left_160x120")
+    record, states = read_record(folder), read_states(folder)
+    assert record.camera.fixed_to == "left_tool" and record.camera.position[2] > 0.07
+    assert states.extrinsics.shape == (12, 4, 4) and states.robot_mask.shape == (12, 120, 160)
+    assert read_video(folder / "rgb.mkv").shape == read_video(folder / "robot.mkv").shape == (12, 120, 160, 3)
+    assert states.robot_mask.any((1, 2)).all()
+    assert inspect(data, "--pictures", tmp_path / "sheets", "--views", "head", "wrist_left_160x120")[0] == 0
+    sheet = cv2.imread(str(tmp_path / "sheets" / f"{folder_name(TASK)}_0.png"))
+    assert sheet.shape[1] == LABEL_WIDTH + 6 * (320 + GAP)
+
+
+def test_a_damaged_view_is_named(data: Path, inspect: Inspect) -> None:
+    inspect(data, "--render", "--cameras", "side", "--size", "160x120")
+    folder = view_episode(episode_folder(data, TASK, 0, "franka_panda"), "side_160x120")
+    edit_header(folder, hashes=read_record(folder).hashes | {"robot": "0" * 64})
+    code, _, told = inspect(data, "--verify")
+    assert code == 2 and f"{folder}: robot has hash" in told
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (("--cameras", "wrist_left"), "names views to make; add --render"),
+        (("--render", "--cameras", "wrist"), "there is no camera 'wrist'"),
+        (("--render", "--cameras", "head", "--size", "640x481"), "the size is '640x481'; expected WIDTHxHEIGHT"),
+        (("--render", "--cameras", "none.yaml"), "cannot read the config none.yaml"),
+        (("--pictures", "sheets", "--views", "wrist_left"), "has no view 'wrist_left', but head; add it by"),
+    ],
+)
+def test_views_that_cannot_be_made_or_shown_are_told_in_one_line(
+    flags: tuple[str, ...], message: str, made: Path, tmp_path: Path, inspect: Inspect, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    code, _, told = inspect(made, *flags)
+    assert code == 2 and message in told and told.count("\n") == 1
 
 
 def test_every_damaged_episode_is_named(data: Path, inspect: Inspect) -> None:

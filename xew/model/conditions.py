@@ -20,9 +20,10 @@ import numpy as np
 from jaxtyping import Float, Float32, Shaped, UInt8
 from scipy.spatial.transform import Rotation
 
+from xew.config import ConfigError
 from xew.episode import Record, States, data_folder, read_pixels
 from xew.model.video.frames import TEMPORAL_FACTOR
-from xew.protocol import ARMS
+from xew.protocol import ARMS, CAMERA_SIZE
 
 if TYPE_CHECKING:
     import xew.sim_warp.embodiment.spec
@@ -42,9 +43,9 @@ class Command:
     action: Float[np.ndarray, "t 16"]
     """Commanded joints [t 16] float32, in the canonical layout."""
     intrinsics: Float[np.ndarray, "3 3"]
-    """Matrix K [3 3] of the head camera [pixels]."""
-    extrinsics: Float[np.ndarray, "4 4"]
-    """Matrix [4 4] from the world to the head camera's frame."""
+    """Matrix K [3 3] of the camera [pixels]."""
+    extrinsics: Float[np.ndarray, "*t 4 4"]
+    """Matrix [4 4] from the world to the camera's frame, or [t 4 4] of a camera that the commands move."""
     render_path: Path
     """Path of the robot-only video, posed by `action` on white."""
     rendered: Video | None = None
@@ -53,6 +54,8 @@ class Command:
     """Data set of the episode, which may hold custom robots."""
     read_first: Callable[[], Video] | None = None
     """Function that reads the first frame of the scene [1 h w 3] uint8."""
+    size: tuple[int, int] = CAMERA_SIZE
+    """Width and height of the camera's picture [pixels]."""
 
     @cached_property
     def render(self) -> Video:
@@ -78,6 +81,11 @@ class Command:
         """The scene without the robot, where closed grippers carry objects of the first frame: [t h w 3] uint8."""
         from xew.model.video.carried_scene import View, carry
 
+        if self.extrinsics.ndim == 3:
+            raise ConfigError(
+                "carried_render needs a camera that stands still, and the camera of this view moves with the robot; use "
+                "--model.embodiment pasted_render or robot_render."
+            )
         assert self.read_first is not None
         grippers = self.action[:, [gripper for _, gripper in ARMS]]
         return carry(self.read_first()[0], self.render, self.tools, grippers, View(self.intrinsics, self.extrinsics))
@@ -94,7 +102,7 @@ class Command:
         """The simulator's camera."""
         from xew.sim_warp.geometry.camera import Camera
 
-        return Camera(self.intrinsics, self.extrinsics)
+        return Camera(self.intrinsics, self.extrinsics, *self.size)
 
 
 def keep_numbers(numbers: Shaped[np.ndarray, "t n"]) -> Shaped[np.ndarray, "t n"]:
@@ -181,7 +189,17 @@ def make_command(
     """The command of an episode; videos [t h w 3] as in `episodes.commands.episode_command`."""
     render, data = folder / "robot.mkv", data_folder(folder)
     first = partial(read_pixels, folder, "rgb", most=1, record=record) if scene is None else partial(np.copy, scene[:1])
-    return Command(record.robot, states.action, states.intrinsics, states.extrinsics, render, rendered, data, first)
+    extrinsics = _move_camera(record, states, data) if record.camera.moves else states.extrinsics
+    size = states.robot_mask.shape[2], states.robot_mask.shape[1]
+    return Command(record.robot, states.action, states.intrinsics, extrinsics, render, rendered, data, first, size)
+
+
+def _move_camera(record: Record, states: States, data: Path) -> Float[np.ndarray, "t 4 4"]:
+    """World to camera [t 4 4] as the commands move it: what was measured is not known in advance."""
+    from xew.sim_warp.cameras import commanded_camera
+    from xew.sim_warp.robots import recorded_robot
+
+    return commanded_camera(record.camera, recorded_robot(record.robot, data), states).extrinsics
 
 
 def joints(command: Command) -> Float[np.ndarray, "t 16"]:
@@ -282,10 +300,16 @@ def tool_poses(command: Command) -> Poses:
 
 
 def camera(command: Command) -> Float[np.ndarray, "t 16"]:
-    """The camera's 16 numbers (`mechanisms.CAMERA`) at every frame: [t 16] float32."""
-    k, rotation, offset = command.intrinsics, command.extrinsics[:3, :3], command.extrinsics[:3, 3]
-    numbers = np.concatenate([[k[0, 0], k[1, 1], k[0, 2], k[1, 2]], rotation.ravel(), -rotation.T @ offset])
-    return np.tile(numbers.astype(np.float32), (len(command.action), 1))
+    """The camera's 16 numbers (`mechanisms.CAMERA`) at every frame, for 320x240 pixels: [t 16] float32."""
+    if command.size[0] * CAMERA_SIZE[1] != command.size[1] * CAMERA_SIZE[0]:
+        raise ConfigError("the condition camera is of pictures of 4:3, such as 640x480; {}x{} is not.".format(*command.size))
+    frames = len(command.action)
+    k = command.intrinsics * CAMERA_SIZE[0] / command.size[0]
+    extrinsics = np.broadcast_to(command.extrinsics, (frames, 4, 4))
+    rotation, offset = extrinsics[:, :3, :3], extrinsics[:, :3, 3]
+    lens = np.tile([k[0, 0], k[1, 1], k[0, 2], k[1, 2]], (frames, 1))
+    position = -np.einsum("tji,tj->ti", rotation, offset)
+    return np.concatenate([lens, rotation.reshape(frames, 9), position], axis=1).astype(np.float32)
 
 
 RELATIVE_SCALE = 20.0

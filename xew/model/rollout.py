@@ -1,7 +1,7 @@
 """Rollouts: predict episodes with a trained model from their first frame and their commands.
 
 Reads  a run, or a config that names published weights; episodes
-Writes <out>/<task>/<seed>/<robot>/rgb.mkv (lossless, 320x240) and rollout.json
+Writes <out>/<task>/<seed>/<robot>/rgb.mkv (lossless, at the camera's size) and rollout.json
 
 Episodes are predicted in batches over all devices, in parallel with reading the next two batches and writing the previous one.
 Command: python -m xew.model.rollout RUN --data DATA --split test [--robots … --out … --rollout.steps …]
@@ -26,7 +26,7 @@ from xew.command_line import find_path, parse_command
 from xew.compilation import keep_compiled_programs
 from xew.concurrency import map_in_order, usable_cores
 from xew.config import CONVERTER, ConfigError, admit, find_config, is_packaged, user_errors
-from xew.dataset import Episode
+from xew.dataset import Episode, view_folder
 from xew.episode import Record, episode_folder, remove_left_overs
 from xew.files import hold_lock, read_json
 from xew.model.cache.scales import Scale, load_run_scales
@@ -44,7 +44,7 @@ from xew.model.sampling.predict import Prediction, Predictor, make_predictor
 from xew.model.settings.checks import check_experiment
 from xew.model.settings.settings import RolloutSettings
 from xew.model.training.step import make_trainer
-from xew.model.video.frames import to_camera_size
+from xew.model.video.frames import Size, to_camera_size
 from xew.rollout import write_rollout
 
 Item = tuple[Episode, dict[str, Any]]
@@ -153,11 +153,11 @@ class RolloutWriter:
     Args:
         out: root of the rollout tree.
         done: called in the caller's thread after each written rollout.
-        resize: function applied to each video before writing, or None.
+        resize: function of each video and the size of the camera's picture, applied before writing, or None.
     """
 
     def __init__(
-        self, out: Path, done: Callable[[], Any], resize: Callable[[np.ndarray], np.ndarray] | None = to_camera_size
+        self, out: Path, done: Callable[[], Any], resize: Callable[[np.ndarray, Size], np.ndarray] | None = to_camera_size
     ) -> None:
         self.out, self.done, self.resize = out, done, resize
         self.threads = ThreadPoolExecutor(WRITERS)
@@ -170,7 +170,7 @@ class RolloutWriter:
             self._settle()
 
     def _write(self, record: Record, video: np.ndarray, header: dict[str, Any]) -> Path:
-        resized = video if self.resize is None else self.resize(video)
+        resized = video if self.resize is None else self.resize(video, record.camera.size)
         return write_rollout(self.out, record.task, record.seed, record.robot, resized, header, record.frame_rate)
 
     def _settle(self) -> None:
@@ -242,7 +242,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     predictor, step = load_predictor(run, experiment, flags.checkpoint)
     data, out = flags.data or experiment.data, flags.out or Path("rollouts") / default_name(run)
     check_out(out, data)
-    episodes = select_episodes(data, flags.split, flags.robots or None)
+    episodes = select_episodes(view_folder(data, experiment.view), flags.split, flags.robots or None)
     saved = None if step is None else checkpoint_time(run, step)
     headers = [(episode, rollout_header(experiment, step, saved, episode)) for episode in episodes]
     pending = [item for item in headers if not is_done(out, *item)]

@@ -11,6 +11,7 @@ from functools import cache
 import numpy as np
 
 from xew.config import ConfigError, load, suggestion
+from xew.episode import States
 from xew.names import EpisodeError, check_name
 from xew.protocol import HEAD, HEAD_SPEC, LARGEST_SIDE, CameraSpec
 from xew.sim_warp.embodiment.spec import RobotSpec
@@ -67,6 +68,11 @@ def get_camera(name: str, size: str | None = None) -> CameraSpec:
     return spec
 
 
+def get_views(names: Sequence[str], size: str | None = None) -> list[CameraSpec]:
+    """The cameras with views besides `head`, which every episode has. Raises ConfigError as `get_camera`."""
+    return [spec for spec in (get_camera(name, size) for name in names) if spec.view != HEAD]
+
+
 def parse_size(text: str) -> tuple[int, int]:
     """Width and height [pixels] of a text such as 640x480. Raises ConfigError for a size that no picture has."""
     match = re.fullmatch(r"(\d{1,5})x(\d{1,5})", text)
@@ -115,6 +121,13 @@ def place_camera(spec: CameraSpec, robot: RobotSpec, joint_pos: np.ndarray) -> C
         return camera
     frames = fixed_frames(spec, robot, np.asarray(joint_pos, float))
     return replace(camera, extrinsics=camera.extrinsics @ _invert(frames))
+
+
+def commanded_camera(spec: CameraSpec, robot: RobotSpec, states: States) -> Camera:
+    """An episode's camera while the robot follows its commands; one that stands still is as recorded."""
+    height, width = states.robot_mask.shape[1:]
+    camera = Camera(states.intrinsics, states.extrinsics, width, height)
+    return replace(camera, extrinsics=place_camera(spec, robot, states.action).extrinsics) if spec.moves else camera
 
 
 def fixed_frames(spec: CameraSpec, robot: RobotSpec, joint_pos: np.ndarray) -> np.ndarray:

@@ -22,12 +22,22 @@ import tyro
 from tqdm import tqdm
 
 from xew.config import user_errors
-from xew.dataset import find_records
+from xew.dataset import find_records, read_dataset
 from xew.episode import EpisodeError, Record, remove_left_overs
 from xew.files import hold_lock
-from xew.protocol import SEED_STARTS, TEST_SEEDS_PER_TASK, TRAIN_SEEDS_PER_TASK, expand_robots, seed_split, split_key
+from xew.protocol import (
+    HEAD,
+    SEED_STARTS,
+    TEST_SEEDS_PER_TASK,
+    TRAIN_SEEDS_PER_TASK,
+    expand_robots,
+    seed_split,
+    split_key,
+)
+from xew.sim_warp.cameras import demand_sight, get_views
 from xew.sim_warp.changes.scenes import check_change, demand_change
 from xew.sim_warp.devices.workers import Workers, find_device, find_devices, quiet_warp, worker_count
+from xew.sim_warp.inspection.checks import render_views
 from xew.sim_warp.manifest import PACKAGED, Manifest, read_manifest
 from xew.sim_warp.production.cells import Job
 from xew.sim_warp.production.produce import Production, make_scenes
@@ -80,6 +90,11 @@ class Args:
     between the task's waypoints on its own path, in its own time and from its own rest posture."""
     states_only: bool = False
     """Store states and all hashes without videos; `python -m xew.sim_warp.inspect DATA --render` makes videos on demand."""
+    cameras: tuple[str, ...] = (HEAD,)
+    """Cameras with a view of each accepted episode: head, wrist_left, wrist_right, front, side, or YAML files
+    (docs/cameras.md). The head camera at 320x240 is always there."""
+    size: str | None = None
+    """Size of these views, such as 640x480; default: the camera's."""
     manifest: Path = PACKAGED
     """File with the seeds that are known to fail."""
     search: bool = False
@@ -227,8 +242,13 @@ def main() -> None:
     quiet_warp()
     args = tyro.cli(Args, description=__doc__)
     print(f"device: {', '.join(device.name for device in find_devices(args.device))}")
+    views = get_views(args.cameras, args.size)
+    if views:
+        demand_sight(views, [get_robot(name, args.folder) for name in expand_robots(args.robots)])
     with hold_lock(args.folder):
         families = generate(args)
+        if views:
+            render_views(read_dataset(args.folder).accepted, views)
     print(yield_table([record for family in families for seed in family.done.values() for record in seed.values()]))
     demand_enough(families)
 

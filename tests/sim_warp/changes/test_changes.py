@@ -154,7 +154,7 @@ def test_a_raised_plan_keeps_home_and_the_clock() -> None:
     task = TASKS[name]
     flat, raised = (make_plan(task, make_scene(task, name, 0, change)).path().pose for change in ("", "height:3"))
     assert flat.shape == raised.shape and np.array_equal(flat[0], raised[0])
-    assert np.allclose((raised - flat)[-1, :, 2], raised_by(Change("height", 3)))
+    assert np.allclose(np.sort((raised - flat)[-1, :, 2]), [raised_by(Change("height", 3)), 0]), "the idle arm waits as before"
 
 
 def test_rendering_from_states_agrees_with_making(data: Callable[[str], Path], tmp_path: Path, renderer: Renderer) -> None:

@@ -1,6 +1,6 @@
-"""Checks of a data set: hashes, plausible motion and re-rendering; and rendering of missing videos."""
+"""Checks of a data set: hashes, plausible motion and re-rendering; and rendering of missing videos and views."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Sequence
 from functools import cache, partial
 from pathlib import Path
 from typing import TypeVar
@@ -9,13 +9,16 @@ import numpy as np
 from tqdm import tqdm
 
 from xew.concurrency import usable_cores
+from xew.dataset import Episode
 from xew.episode import EpisodeError, Record, data_folder, verify_episode
-from xew.protocol import RANDOM_CHANGE
+from xew.protocol import RANDOM_CHANGE, CameraSpec
+from xew.sim_warp.cameras import demand_sight
 from xew.sim_warp.changes.scenes import check_change
 from xew.sim_warp.devices.workers import Workers, find_devices, worker_count
-from xew.sim_warp.production.rerender import add_videos, demand_plausible, render_again, render_changed
+from xew.sim_warp.production.rerender import add_videos, add_view, demand_plausible, render_again, render_changed
 from xew.sim_warp.production.warm_up import compile_kernels
 from xew.sim_warp.rendering.render import Renderer
+from xew.sim_warp.robots import recorded_robot
 from xew.sim_warp.robots.user.own import KEPT, keep_robot, kept_robot
 
 Result = TypeVar("Result")
@@ -56,20 +59,31 @@ def rerender(folders: list[Path], count: int) -> None:
 
 def render_videos(folders: list[Path]) -> None:
     """Make and store the videos of episodes that have none."""
-    for _ in map_rendering(_render_video, folders):
-        pass
+    _render_all(_render_video, folders)
     print(f"videos of {len(folders)} episodes made from their states")
 
 
-def map_rendering(render: Callable[[Path], Result], folders: list[Path]) -> Iterator[Result]:
-    """The result of a function for each folder, in worker processes if there are many folders."""
+def render_views(cells: Sequence[Episode], specs: Sequence[CameraSpec]) -> None:
+    """Make and store the views of cameras of episodes, where they are missing.
+
+    Raises ConfigError, before anything is rendered, for a camera that sees nothing of a robot or is fixed to no link of it.
+    """
+    robots = {record.robot: recorded_robot(record.robot, data_folder(folder)) for folder, record in cells}
+    demand_sight(specs, list(robots.values()))
+    for spec in specs:
+        made = _render_all(partial(_render_view, spec=spec), [folder for folder, _ in cells])
+        print(f"view {spec.view}: {sum(made)} of {len(cells)} episodes new")
+
+
+def _render_all(render: Callable[[Path], Result], folders: list[Path]) -> list[Result]:
+    """Render episodes in worker processes if there are many, else here; returns the results in any order."""
     devices = find_devices(None)
     several = len(folders) >= 2 * EPISODES_PER_WORKER
     with Workers(worker_count(devices), devices) as workers:
         if several:
             compile_kernels(workers, devices[0], 1, ("rendering",))
         results = workers.run(render, folders) if several else map(render, folders)
-        yield from tqdm(results, desc="rendering", unit="episode", total=len(folders))
+        return list(tqdm(results, desc="rendering", unit="episode", total=len(folders)))
 
 
 def render_changes(folders: list[Path], change: str, out: Path) -> None:
@@ -81,9 +95,7 @@ def render_changes(folders: list[Path], change: str, out: Path) -> None:
     for key in sorted({folder.name for folder in folders}):
         if (data / KEPT / key).is_dir() and (robot := kept_robot(key, data)) is not None:
             keep_robot(robot, out)
-    failed = [
-        record for record in map_rendering(partial(_render_change, change=change, out=out), folders) if not record.success
-    ]
+    failed = [record for record in _render_all(partial(_render_change, change=change, out=out), folders) if not record.success]
     print(f"{len(folders) - len(failed)} of {len(folders)} episodes rendered with the change {change} into {out}")
     for record in failed:
         print(f"{record.task} {record.seed} {record.robot}: {record.failure_detail}")
@@ -96,9 +108,16 @@ def _renderer() -> Renderer:
 
 
 def _render_change(folder: Path, change: str, out: Path) -> Record:
+    """Write one episode with a change to another data set; returns its header."""
     return render_changed(folder, change, out, _renderer())
 
 
-def _render_video(folder: Path) -> None:
+def _render_video(folder: Path) -> bool:
     """Make and store the videos of one episode, in a worker process or here."""
     add_videos(folder, _renderer())
+    return True
+
+
+def _render_view(folder: Path, spec: CameraSpec) -> bool:
+    """Make and store one view of an episode; returns whether it was missing."""
+    return add_view(folder, spec, _renderer())

@@ -2,6 +2,7 @@
 
 import math
 from collections import defaultdict
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -9,9 +10,11 @@ import numpy as np
 from PIL import Image
 from tqdm import tqdm
 
+from xew.dataset import view_episode
 from xew.episode import HEIGHT, WIDTH, EpisodeError, Record, encode_png, read_pixels, read_record, read_states
 from xew.files import replacing, write_bytes
 from xew.names import folder_name, path_below
+from xew.protocol import HEAD
 from xew.sim_warp.robots import ROBOTS
 
 STRIP_FRAMES = 8
@@ -26,13 +29,13 @@ LABEL_WIDTH, LABEL_HEIGHT, TEXT_SCALE = 96, 24, 0.42
 """Size of the labels in a grid or sheet [pixels], and the scale of their letters."""
 
 
-def draw_pictures(cells: list[tuple[Path, Record]], out: Path, seeds: int) -> None:
-    """Draw sheets and strips of the first seeds of each task, as PNG."""
+def draw_pictures(cells: list[tuple[Path, Record]], out: Path, seeds: int, views: Sequence[str] = (HEAD,)) -> None:
+    """Draw sheets, with these views side by side, and strips of the first seeds of each task, as PNG."""
     by_task = seeds_by_task(cells)
     _make_folder(out, "--pictures")
     for task, of_task in tqdm(by_task.items(), desc="drawing", unit="task"):
         for seed in sorted(of_task)[:seeds]:
-            save_png(path_below(out, f"{folder_name(task)}_{seed}.png"), contact_sheet(of_task[seed]))
+            save_png(path_below(out, f"{folder_name(task)}_{seed}.png"), contact_sheet(of_task[seed], views))
             for folder, record in of_task[seed]:
                 save_png(path_below(out, f"{folder_name(task)}_{seed}_{folder_name(record.robot)}.png"), strip(folder))
 
@@ -117,16 +120,22 @@ def _label(text: str, width: int, height: int = LABEL_HEIGHT) -> np.ndarray:
     return cv2.putText(image, text, place, cv2.FONT_HERSHEY_SIMPLEX, scale, (40, 40, 40), 1, cv2.LINE_AA)
 
 
+def to_height(image: np.ndarray, height: int = HEIGHT) -> np.ndarray:
+    """An image [h w 3] at another height and the same aspect ratio."""
+    width = round(image.shape[1] * height / len(image))
+    return image if len(image) == height else cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+
+
 def _halve(image: np.ndarray) -> np.ndarray:
     return cv2.resize(image, (image.shape[1] // 2, image.shape[0] // 2), interpolation=cv2.INTER_AREA)
 
 
-def contact_sheet(cells: list[tuple[Path, Record]]) -> np.ndarray:
-    """The instruction over one row per robot: its start, middle and end: [h w 3] uint8."""
+def contact_sheet(cells: list[tuple[Path, Record]], views: Sequence[str] = (HEAD,)) -> np.ndarray:
+    """The instruction over one row per robot: its start, middle and end in each view: [h w 3] uint8."""
     rows = []
     for folder, _ in cells:
-        video = read_pixels(folder, "rgb")
-        rows.append([video[round(time * (len(video) - 1))] for time in SHEET_TIMES])
+        videos = [read_pixels(view_episode(folder, view), "rgb") for view in views]
+        rows.append([to_height(video[round(time * (len(video) - 1))]) for video in videos for time in SHEET_TIMES])
     names = np.concatenate([_label(record.robot, LABEL_WIDTH, HEIGHT + GAP) for _, record in cells])
     pictures = np.concatenate([names, tile(rows)], 1)
     record = cells[0][1]

@@ -1,10 +1,11 @@
-"""Re-rendering of episodes from recorded states, missing videos, and the plausibility check of their motion."""
+"""Re-rendering of episodes from recorded states: missing videos and other views; and the plausibility check of motion."""
 
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from xew.dataset import VIEWS
 from xew.episode import (
     EpisodeError,
     Record,
@@ -12,17 +13,19 @@ from xew.episode import (
     array_hash,
     data_folder,
     demand_known,
+    episode_folder,
     place_episode,
     read_record,
     read_states,
     states_hash,
     write_episode,
 )
-from xew.protocol import OWN_MOTION, parse_change
+from xew.names import path_below
+from xew.protocol import OWN_MOTION, CameraSpec, parse_change
+from xew.sim_warp.cameras import fix_camera, place_camera
 from xew.sim_warp.changes.looks import camera_of, stage_of
 from xew.sim_warp.changes.scenes import change_of, demand_change, make_plan, make_scene
 from xew.sim_warp.embodiment.spec import RobotSpec
-from xew.sim_warp.geometry.camera import spec_camera
 from xew.sim_warp.kinematics.own_motion import own_commands
 from xew.sim_warp.physics.plausibility import find_implausible
 from xew.sim_warp.production.outcome import find_obstruction
@@ -38,7 +41,7 @@ def render_again(folder: Path, renderer: Renderer) -> tuple[np.ndarray, np.ndarr
     """Render an episode's pixels, mask and keypoints again from its recorded joints, objects and commands.
 
     Returns:
-        The head camera's and the robot's video [t h w 3] uint8, whose hashes agree with the recorded ones.
+        The camera's and the robot's video [t h w 3] uint8, whose hashes agree with the recorded ones.
 
     Raises:
         EpisodeError: the scene or a hash differs from the recorded one.
@@ -47,7 +50,7 @@ def render_again(folder: Path, renderer: Renderer) -> tuple[np.ndarray, np.ndarr
     robot = recorded_robot(record.robot, data_folder(folder))
     demand_known(folder, "joint_pos", "object_pose")
     scene = _sample_again(folder, record)
-    again, rgb, render = _draw(robot, scene, read_states(folder), record.change, renderer)
+    again, rgb, render = _render_view(robot, scene, read_states(folder, record), record, renderer)
     hashes = {"states": states_hash(again), "rgb": array_hash(rgb), "robot": array_hash(render)}
     hashes["scene"] = scene_hash(scene)
     for name, recorded in (record.hashes | {"scene": record.scene_hash}).items():
@@ -59,14 +62,17 @@ def render_again(folder: Path, renderer: Renderer) -> tuple[np.ndarray, np.ndarr
     return rgb, render
 
 
-def _draw(
-    robot: RobotSpec, scene: Scene, states: States, change: str, renderer: Renderer
+def _render_view(
+    robot: RobotSpec, scene: Scene, states: States, header: Record, renderer: Renderer
 ) -> tuple[States, np.ndarray, np.ndarray]:
-    """The states with what the camera sees of them, and the head camera's and the robot's video [t h w 3] uint8."""
-    wanted = parse_change(change)
-    camera = spec_camera(camera_of(wanted))
+    """The states as the header's camera sees them with its change, its video and the robot's, both [t h w 3] uint8.
+
+    A camera on the robot is moved by the measured joints for the scene, and by the commanded joints for the robot alone.
+    """
+    camera = place_camera(header.camera, robot, states.joint_pos)
     recording = scene_recording(robot, scene, states.joint_pos, states.object_pose, states.object_joint)
-    view = observe(renderer, [recording], camera, stage_of(wanted))[0]
+    view = observe(renderer, [recording], camera, stage_of(parse_change(header.change)))[0]
+    render = command_renders([(robot, states.action)], place_camera(header.camera, robot, states.action), renderer)[0]
     seen = replace(
         states,
         keypoints=view.keypoints,
@@ -75,7 +81,38 @@ def _draw(
         intrinsics=camera.intrinsics,
         extrinsics=camera.extrinsics,
     )
-    return seen, view.rgb, command_renders([(robot, states.action)], camera, renderer)[0]
+    return seen, view.rgb, render
+
+
+def add_view(folder: Path, spec: CameraSpec, renderer: Renderer) -> bool:
+    """Render and write the view of a camera of an accepted episode; returns whether it was missing.
+
+    Raises:
+        EpisodeError: the episode was imported without its objects, or its task has changed.
+        ConfigError: the robot does not have the link that the camera is fixed to.
+    """
+    record = read_record(folder)
+    data = data_folder(folder)
+    robot = recorded_robot(record.robot, data)
+    demand_known(folder, "joint_pos", "object_pose", record=record)
+    fixed = camera_of(parse_change(record.change), fix_camera(spec, robot))
+    states, root = read_states(folder, record), data / VIEWS / spec.view
+    if _shows(episode_folder(root, record.task, record.seed, record.robot), fixed, states):
+        return False
+    header = replace(record, camera=fixed, device=renderer.device.name)
+    seen, rgb, render = _render_view(robot, _sample_again(folder, record), states, header, renderer)
+    write_episode(path_below(data, VIEWS, spec.view), header, seen, rgb, render)
+    return True
+
+
+def _shows(folder: Path, spec: CameraSpec, states: States) -> bool:
+    """Whether a view is of this camera and of these states."""
+    if not (folder / "episode.json").exists():
+        return False
+    record = read_record(folder)
+    seen = read_states(folder, record)
+    same = (np.array_equal(getattr(seen, name), getattr(states, name)) for name in ("action", "joint_pos", "object_pose"))
+    return record.camera == spec and record.videos and all(same)
 
 
 def render_changed(folder: Path, name: str, out: Path, renderer: Renderer) -> Record:
@@ -100,17 +137,17 @@ def render_changed(folder: Path, name: str, out: Path, renderer: Renderer) -> Re
     if record.change or record.source:
         origin = f"was imported from {record.source}" if record.source else f"has the change {record.change}"
         raise EpisodeError(f"{folder} {origin}; expected an unchanged episode that `python -m xew.sim_warp.generate` made.")
-    robot = recorded_robot(record.robot, data_folder(folder))
-    task = recorded_task(record.task)
-    scene = make_scene(task, record.task, record.seed, change)
-    states, rgb, render = _draw(robot, scene, read_states(folder), change, renderer)
-    recording = scene_recording(robot, scene, states.joint_pos, states.object_pose, states.object_joint)
-    camera = camera_of(parse_change(change))
+    robot, states = recorded_robot(record.robot, data_folder(folder)), read_states(folder, record)
+    scene = make_scene(recorded_task(record.task), record.task, record.seed, change)
+    camera = camera_of(parse_change(change), record.camera)
     changed = replace(record, change=change, camera=camera, scene_hash=scene_hash(scene), device=renderer.device.name)
-    if failure := find_obstruction(scene, recording):
+    if failure := find_obstruction(
+        scene, scene_recording(robot, scene, states.joint_pos, states.object_pose, states.object_joint)
+    ):
         failed = replace(changed, success=False, failure=failure[0], failure_detail=failure[1], hashes={}, files={})
         return read_record(write_episode(out, failed))
-    return read_record(write_episode(out, changed, states, rgb, render))
+    seen, rgb, render = _render_view(robot, scene, states, changed, renderer)
+    return read_record(write_episode(out, changed, seen, rgb, render))
 
 
 def add_videos(folder: Path, renderer: Renderer) -> None:

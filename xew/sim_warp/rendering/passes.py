@@ -25,8 +25,8 @@ class Look:
 
     lights: wp.array
     """[l] raster.Light."""
-    shading: shading.Shading
     patterns: shading.Patterns
+    shading: shading.Shading
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ class Passes:
     def look(self, shown: stage.Stage) -> Look:
         """The look of a stage on the device."""
         lights = wp.array([light_of(light) for light in shown.lights], dtype=raster.Light, device=self.device)
-        return Look(lights, stage_shading(shown.ambient), pack_patterns(shown, self.device))
+        return Look(lights, pack_patterns(shown, self.device), stage_shading(shown.ambient))
 
     def draw(self, call: Call, chunk: Chunk) -> Drawn:
         """Visibility of a chunk's frames and, if there are shadows, their shadow maps."""
