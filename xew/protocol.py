@@ -216,6 +216,10 @@ class Change:
         return f"{self.factor}:{self.level}"
 
 
+SHIFTS = tuple(str(Change(factor, level)) for factor in FACTORS for level in range(1, STRENGTHS + 1))
+"""Changes of the protocol of shifts: each factor at the three graded levels."""
+
+
 def parse_change(text: str) -> Change | None:
     """The change that a text such as `light:2` names; None for no change: an empty text or level 0.
 
@@ -355,6 +359,8 @@ PARTS: dict[str, tuple[Variant, ...]] = {
     "bodies": (reference("scaling_seen", embodiment="robot_render"),),
     # With the conditions of the LOEO folds.
     "halves": tuple(reference(split, *MULTI_VIEW) for split in HALVES),
+    # The recommended model, graded on changed scenes (`Study.changes`) as well.
+    "shifts": (reference(action="mask_and_flow_channels", embodiment="pasted_render"),),
 }
 """Variants that each table compares, in the order of its rows. A variant may be in several parts."""
 PAPER_PARTS = ("fixed", "actions", "ladder", "loeo", "few_shot", "forgetting", "baselines")

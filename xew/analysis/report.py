@@ -99,6 +99,8 @@ class Args:
     """Folder that python -m xew.analysis.distance wrote, for a study; without it the paper's distances are used."""
     other_motion: Path | None = None
     """Score table of the same study in the other kind of motion, to compare action representations."""
+    shifted: tuple[Path, ...] = ()
+    """Score tables of the model of the part `shifts` on changed scenes, one for each change."""
     explorer: bool = False
     """Write <out>/explorer too, a page that plays the scenes of the strips, for the report of one run."""
     paper: bool = False
@@ -165,15 +167,17 @@ def _report_study(args: Args, scores: Scores) -> None:
     if args.data and not any(find_records(args.data)):
         raise ConfigError(f"{args.data} holds no episode; make some: python -m xew.sim_warp.generate --out {args.data}")
     other = read_scores(args.other_motion, _own_robots(args.data)) if args.other_motion else None
-    report = report_study.build(scores, args.data, args.rollouts, args.distances, _format_footer(scores.versions), other)
+    shifted = [read_scores(path, _own_robots(args.data)) for path in args.shifted]
+    others = report_study.Others(other, shifted)
+    report = report_study.build(scores, args.data, args.rollouts, args.distances, _format_footer(scores.versions), others)
     _write_report(args.out, report.html, (report.markdown, report.files), report.summary)
 
 
 def _report_scores(args: Args, scores: Scores) -> None:
-    if args.distances or args.other_motion:
+    if args.distances or args.other_motion or args.shifted:
         raise ConfigError(
-            f"--distances and --other-motion are for the report of a study, and {args.scores} is the table of one run; leave "
-            "them out."
+            f"--distances, --other-motion and --shifted are for the report of a study, and {args.scores} is the table of one "
+            "run; leave them out."
         )
     own = [robot for robot in dict.fromkeys(scores.rows["robot"]) if robot not in ROBOT_NAMES]
     for robot in args.held_out:

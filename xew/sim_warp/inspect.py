@@ -21,7 +21,7 @@ from xew.dataset import explain_missing, folder_beside, list_views, read_dataset
 from xew.episode import EpisodeError, Record
 from xew.files import hold_lock
 from xew.names import plain_line
-from xew.protocol import HEAD
+from xew.protocol import HEAD, seed_split
 from xew.sim_warp.cameras import get_views
 from xew.sim_warp.devices.workers import quiet_warp
 from xew.sim_warp.inspection.checks import render_changes, render_videos, render_views, rerender, verify
@@ -50,6 +50,8 @@ class Args:
     """With --render and --out: write the data set with this change, such as light:2, from its states without physics."""
     out: Path | None = None
     """Folder of the changed data set."""
+    split: str | None = None
+    """Family of seeds of the changed data set: train, validation, test or final; default: all."""
     cameras: tuple[str, ...] = ()
     """Cameras whose views --render adds: head, wrist_left, wrist_right, front, side, or YAML files (docs/cameras.md)."""
     size: str | None = None
@@ -130,7 +132,10 @@ def render(cells: list[tuple[Path, Record]], args: Args) -> None:
     views = get_views(args.cameras, args.size)
     with hold_lock(args.out or args.data):
         if args.out:
-            render_changes([folder for folder, _ in cells], args.change, args.out)
+            asked = [folder for folder, record in cells if args.split in (None, seed_split(record.seed))]
+            if not asked:
+                raise EpisodeError(f"{args.data} has no accepted episode of the family {args.split}; choose another --split.")
+            render_changes(asked, args.change, args.out)
             cells = list(read_dataset(args.out).accepted)
         render_videos([folder for folder, record in cells if not record.videos])
         render_views(cells, views)
