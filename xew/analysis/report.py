@@ -52,7 +52,7 @@ from xew.analysis.tables.table import (
     parting_note,
 )
 from xew.config import ConfigError, user_errors
-from xew.dataset import demand_one_motion, find_records
+from xew.dataset import demand_one_change, demand_one_motion, find_records
 from xew.episode import Record, episode_folder, read_pixels
 from xew.files import hold_lock, write_bytes, write_text
 from xew.names import csv_text, plain_markdown
@@ -124,20 +124,21 @@ def main(args: Args) -> None:
             _report_paper(args)
         elif args.scores:
             scores = read_scores(args.scores, _own_robots(args.data))
-            _check_motion(args, scores)
+            _check_data(args, scores)
             (_report_study if scores.of_study else _report_scores)(args, scores)
         else:
             raise ConfigError("no score table was named: give the one that xew.metrics.evaluate wrote, or --paper.")
     print(f"report: {args.out / 'index.html'}")
 
 
-def _check_motion(args: Args, scores: Scores) -> None:
+def _check_data(args: Args, scores: Scores) -> None:
     records = [record for _, record in find_records(args.data)] if args.data else []
     motion = demand_one_motion(args.data, records) if args.data and records else scores.motion
-    if motion != scores.motion:
+    change = demand_one_change(args.data, records) if args.data and records else scores.change
+    if (motion, change) != (scores.motion, scores.change):
         raise ConfigError(
-            f"{args.data} has episodes of {motion} motion, {args.scores} has scores of {scores.motion} motion; name the data"
-            " that was graded."
+            f"{args.data} has episodes of {motion} motion with {change or 'no'} change, {args.scores} has scores of "
+            f"{scores.motion} motion with {scores.change or 'no'} change; name the data that was graded."
         )
 
 

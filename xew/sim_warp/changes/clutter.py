@@ -29,7 +29,7 @@ SHOULDERS = ((-0.25, -0.45), (0.25, -0.45))
 HAND, FOREARM, GAP = 0.11, 0.07, 0.02
 """Distances from the way of a tool, from the line to its shoulder, and between objects [m]."""
 CLEARANCE = 0.02
-"""Least distance of clutter from points on everything that moves [m], more than the distance between these points."""
+"""Least distance of clutter from dense points on all links and objects, at every frame [m]."""
 MARGIN = 8
 """Least distance of a place from the picture's border [pixels]."""
 TRIES = 300
