@@ -191,8 +191,8 @@ def view_folder(data: Path, view: str) -> Path:
 
 
 def view_episode(folder: Path, view: str) -> Path:
-    """The folder of an episode in a view of its data set. Raises EpisodeError if the view does not have it."""
-    seen = view_folder(data_folder(folder), view).joinpath(*folder.absolute().parts[-3:])
+    """The folder of an episode, of any view, in a view of its data set. Raises EpisodeError if the view does not have it."""
+    seen = view_folder(base_data(data_folder(folder)), view).joinpath(*folder.absolute().parts[-3:])
     if not seen.is_dir():
         raise EpisodeError(f"the view {view} has no episode {seen}; run `inspect DATA --render --cameras …` again to add it.")
     return seen

@@ -85,7 +85,7 @@ def test_another_camera_that_does_not_fit_is_told(tmp_path: Path) -> None:
     with h5py.File(path, "a") as file:
         del file["observation/left_camera/extrinsic_cv"]
         file["observation/left_camera/extrinsic_cv"] = np.zeros((made.FRAMES - 1, 3, 4))
-    with pytest.raises(EpisodeError, match="left_camera/extrinsic_cv has shape .*; expected one matrix for each of 5 frames"):
+    with pytest.raises(EpisodeError, match=r"left_camera/extrinsic_cv has shape .*; expected one matrix for each of 5 frames"):
         read_robotwin(path)
 
 
