@@ -133,9 +133,9 @@ def add_tiled(folder: Path, views: Sequence[str]) -> bool:
         return False
     states = [read_states(part) for part in parts]
     seen = replace(states[0], robot_mask=np.concatenate([of_part.robot_mask for of_part in states], axis=1))
-    videos = (np.concatenate([read_pixels(part, name) for part in parts], axis=1) for name in ("rgb", "robot"))
+    rgb, robot = (np.concatenate([read_pixels(part, name) for part in parts], axis=1) for name in ("rgb", "robot"))
     camera = replace(first.camera, name="+".join(views), size=(width, height * len(views)))
-    write_episode(root, replace(first, camera=camera), seen, *videos)
+    write_episode(root, replace(first, camera=camera), seen, rgb, robot)
     return True
 
 
