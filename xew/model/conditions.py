@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from xew.config import ConfigError
 from xew.dataset import view_episode
-from xew.episode import Record, States, data_folder, read_pixels, read_record, read_states
+from xew.episode import EpisodeError, Record, States, data_folder, read_pixels, read_record, read_states
 from xew.model.video.frames import TEMPORAL_FACTOR
 from xew.protocol import ARMS, CAMERA_SIZE
 
@@ -202,8 +202,10 @@ def make_command(
 
 
 def _part_command(folder: Path) -> Command:
-    """The command of a view that is part of a tiled picture."""
+    """The command of a view that is part of a tiled picture. Raises EpisodeError if it is tiled itself."""
     record = read_record(folder)
+    if record.camera.parts:
+        raise EpisodeError(f"{folder} is part of a tiled view and is tiled itself; delete it, or tile other views.")
     return make_command(folder, record, read_states(folder, record))
 
 
@@ -318,7 +320,9 @@ def camera(command: Command) -> Float[np.ndarray, "t 16"]:
     if command.parts or command.size[0] * CAMERA_SIZE[1] != command.size[1] * CAMERA_SIZE[0]:
         raise ConfigError("the condition camera is of one picture of 4:3, such as 640x480; {}x{} is not.".format(*command.size))
     frames = len(command.action)
-    k = command.intrinsics * CAMERA_SIZE[0] / command.size[0]
+    scale = CAMERA_SIZE[0] / command.size[0]
+    k = command.intrinsics * scale
+    k[:2, 2] += (scale - 1) / 2  # (0, 0) is the center of a pixel
     extrinsics = np.broadcast_to(command.extrinsics, (frames, 4, 4))
     rotation, offset = extrinsics[:, :3, :3], extrinsics[:, :3, 3]
     lens = np.tile([k[0, 0], k[1, 1], k[0, 2], k[1, 2]], (frames, 1))

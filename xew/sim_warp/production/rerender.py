@@ -125,8 +125,8 @@ def add_tiled(folder: Path, views: Sequence[str]) -> bool:
     parts = [view_episode(folder, view) for view in views]
     records = [read_record(part) for part in parts]
     sizes = {record.camera.size for record in records}
-    if len(sizes) > 1:
-        raise EpisodeError(f"{folder}: the views {', '.join(views)} have the sizes {sorted(sizes)}; tile views of one size.")
+    if len(sizes) > 1 or any(record.camera.parts for record in records):
+        raise EpisodeError(f"{folder}: the views {', '.join(views)} have the sizes {sorted(sizes)}; tile cameras of one size.")
     first, ((width, height),) = records[0], sizes
     root = path_below(data_folder(folder), VIEWS, "+".join(views))
     if (episode_folder(root, first.task, first.seed, first.robot) / "episode.json").exists():
