@@ -206,7 +206,8 @@ def list_views(data: Path) -> list[str]:
 def base_data(data: Path) -> Path:
     """The data set that a view's data set lies in; another data set is its own."""
     root = Path(data).absolute()
-    return root.parents[1] if root.parent.name == VIEWS else Path(data)
+    is_view = root.parent.name == VIEWS and next(root.parents[1].glob("*/*/*/episode.json"), None) is not None
+    return root.parents[1] if is_view else Path(data)
 
 
 def folder_beside(data: Path, name: str) -> Path:

@@ -127,7 +127,9 @@ def test_views_are_added_and_the_head_camera_s_episodes_keep_their_bytes(data: P
     assert inspect(data, "--pictures", tmp_path / "sheets", "--views", "head", "wrist_left_160x120")[0] == 0
     sheet = cv2.imread(str(tmp_path / "sheets" / f"{folder_name(TASK)}_0.png"))
     assert sheet.shape[1] == LABEL_WIDTH + 6 * (320 + GAP)
-    assert inspect(data / "views" / "wrist_left_160x120", "--grid", tmp_path / "grid.png")[0] == 0
+    view = data / "views" / "wrist_left_160x120"
+    assert inspect(view, "--grid", tmp_path / "grid.png")[0] == 0
+    assert f"{view} is a view; add views to its data set: {data}" in inspect(view, "--render", "--cameras", "side")[2]
 
 
 def test_conditions_of_a_view_are_drawn_for_its_commanded_camera(data: Path, inspect: Inspect) -> None:

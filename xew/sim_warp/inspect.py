@@ -17,7 +17,7 @@ from typing import Annotated
 import tyro
 
 from xew.config import admit, user_errors
-from xew.dataset import explain_missing, folder_beside, list_views, read_dataset, view_folder
+from xew.dataset import base_data, explain_missing, folder_beside, list_views, read_dataset, view_folder
 from xew.episode import EpisodeError, Record, read_record
 from xew.files import hold_lock
 from xew.names import plain_line
@@ -118,6 +118,8 @@ def render(cells: list[tuple[Path, Record]], args: Args) -> None:
     """Make missing videos, and the views of --cameras."""
     if not args.render:
         raise EpisodeError(f"{' '.join(args.cameras or args.tile)}: views are made by --render; add it.")
+    if (base := base_data(args.data)) != args.data:
+        raise EpisodeError(f"{args.data} is a view; add views to its data set: {base}.")
     if len(args.tile) == 1:
         raise EpisodeError(f"--tile {args.tile[0]} is one view, expected at least two.")
     views = get_views(args.cameras, args.size)
