@@ -203,8 +203,8 @@ def view_folder(data: Path, view: str) -> Path:
 
 
 def view_episode(folder: Path, view: str) -> Path:
-    """The folder of an episode in a view of its data set. Raises EpisodeError if the view does not have it."""
-    seen = view_folder(data_folder(folder), view).joinpath(*folder.absolute().parts[-3:])
+    """The folder of an episode, of any view, in a view of its data set. Raises EpisodeError if the view does not have it."""
+    seen = view_folder(base_data(data_folder(folder)), view).joinpath(*folder.absolute().parts[-3:])
     if not seen.is_dir():
         raise EpisodeError(f"the view {view} has no episode {seen}; run `inspect DATA --render --cameras …` again to add it.")
     return seen
@@ -218,7 +218,8 @@ def list_views(data: Path) -> list[str]:
 def base_data(data: Path) -> Path:
     """The data set that a view's data set lies in; another data set is its own."""
     root = Path(data).absolute()
-    return root.parents[1] if root.parent.name == VIEWS else Path(data)
+    is_view = root.parent.name == VIEWS and next(root.parents[1].glob("*/*/*/episode.json"), None) is not None
+    return root.parents[1] if is_view else Path(data)
 
 
 def folder_beside(data: Path, name: str) -> Path:

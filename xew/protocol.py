@@ -63,7 +63,12 @@ class CameraSpec:
     def view(self) -> str:
         """Name of the camera's view in a data set: the camera's name, with the size if that is not 320x240."""
         width, height = self.size
-        return self.name if self.size == CAMERA_SIZE else f"{self.name}_{width}x{height}"
+        return self.name if self.parts or self.size == CAMERA_SIZE else f"{self.name}_{width}x{height}"
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """The views that this one tiles into one picture, from top to bottom, named head+wrist_left; usually none."""
+        return tuple(self.name.split("+")) if "+" in self.name else ()
 
     @property
     def moves(self) -> bool:

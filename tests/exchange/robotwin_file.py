@@ -95,7 +95,7 @@ def write_legacy(path: Path, size: tuple[int, int] = (WIDTH, HEIGHT)) -> Path:
 
 
 def wrist_extrinsics(arm: int) -> np.ndarray:
-    """[t 4 4] world to a camera 0.1 m behind the tool center point that looks along the hand, its picture's right to the hand's y."""
+    """[t 4 4] world to a camera 0.1 m behind the tool center point that looks along the hand."""
     to_tool = np.linalg.inv(matrix_from_pose(tool_poses()[:, arm]))
     return np.array([[0, 1, 0, 0], [0, 0, 1, 0], [1, 0, 0, 0.1], [0, 0, 0, 1.0]]) @ to_tool
 

@@ -146,6 +146,7 @@ def test_an_impossible_size_is_refused(text: str) -> None:
     ("lines", "message"),
     [
         ("name: a/b", "name of a camera is 'a/b'"),
+        ("name: a+b", "its name has a ., as tiled views have"),
         ("name: own\nvertical_fov: 0", "field of view of 0 degrees"),
         ("name: own\nposition: [0, 0, 1]\ntarget: [0, 0, 0]", "choose a target away"),
         ("name: own\nsize: [320, 100]", "the size is '320x100'"),

@@ -13,9 +13,12 @@ import numpy as np
 import pytest
 
 from tests.sim_warp.small import SLOW, TASK, WITH_SLOW, produce
+from xew.config import ConfigError
 from xew.dataset import VIEWS, list_views, view_episode
 from xew.episode import States, episode_folder, read_record, read_states, read_video, write_episode
+from xew.model.episodes.commands import episode_command
 from xew.names import folder_name
+from xew.sim_warp.cameras import place_camera
 from xew.sim_warp.inspect import main, read_headers
 from xew.sim_warp.inspection.pictures import (
     GAP,
@@ -33,6 +36,7 @@ from xew.sim_warp.inspection.visibility import visibility_section
 from xew.sim_warp.production.cells import Job
 from xew.sim_warp.production.surfaces import Seen, Visibility, count_visible, read_surfaces
 from xew.sim_warp.rendering.render import Renderer
+from xew.sim_warp.robots import get_robot
 
 ROBOTS = ("franka_panda", SLOW)
 Inspect = Callable[..., tuple[int, str, str]]
@@ -123,6 +127,31 @@ def test_views_are_added_and_the_head_camera_s_episodes_keep_their_bytes(data: P
     assert inspect(data, "--pictures", tmp_path / "sheets", "--views", "head", "wrist_left_160x120")[0] == 0
     sheet = cv2.imread(str(tmp_path / "sheets" / f"{folder_name(TASK)}_0.png"))
     assert sheet.shape[1] == LABEL_WIDTH + 6 * (320 + GAP)
+    view = data / "views" / "wrist_left_160x120"
+    assert inspect(view, "--grid", tmp_path / "grid.png")[0] == 0
+    assert f"{view} is a view; add views to its data set: {data}" in inspect(view, "--render", "--cameras", "side")[2]
+
+
+def test_conditions_of_a_view_are_drawn_for_its_commanded_camera(data: Path, inspect: Inspect) -> None:
+    """The camera of a tiled view's lower picture is on the hand, as the commands move it."""
+    views = ("side_160x120", "wrist_right_160x120")
+    inspect(data, "--render", "--cameras", "side", "wrist_right", "--size", "160x120", "--tile", *views)
+    base = episode_folder(data, TASK, 0, "franka_panda")
+    above, below, tiled = (view_episode(base, view) for view in (*views, "+".join(views)))
+    robot = read_video(tiled / "robot.mkv")
+    np.testing.assert_array_equal(robot, np.concatenate([read_video(part / "robot.mkv") for part in (above, below)], axis=1))
+    command = episode_command(tiled, read_record(tiled))
+    np.testing.assert_array_equal(command.streams.render, robot)
+    assert command.streams.mask[:, 120:].any() and command.streams.optical_flow.shape == (12, 240, 160, 2)
+    on_hand = episode_command(below, read_record(below))
+    states = read_states(below)
+    expected = place_camera(read_record(below).camera, get_robot("franka_panda"), states.action)
+    np.testing.assert_array_equal(on_hand.extrinsics, expected.extrinsics)
+    assert np.abs(states.action - states.joint_pos).max() > 1e-4 and not np.array_equal(on_hand.extrinsics, states.extrinsics)
+    with pytest.raises(ConfigError, match="carried_render needs one camera that stands still"):
+        _ = on_hand.carried_scene
+    out = inspect(data, "--verify", "--rerender", 9)[1]
+    assert "8 of 8 episodes agree" in out and "6 episodes rendered again" in out
 
 
 def test_a_damaged_view_is_named(data: Path, inspect: Inspect) -> None:
@@ -136,7 +165,7 @@ def test_a_damaged_view_is_named(data: Path, inspect: Inspect) -> None:
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
-        (("--cameras", "wrist_left"), "names views to make; add --render"),
+        (("--cameras", "wrist_left"), "wrist_left: views are made by --render; add it"),
         (("--render", "--cameras", "wrist"), "there is no camera 'wrist'"),
         (("--render", "--cameras", "head", "--size", "640x481"), "the size is '640x481'; expected WIDTHxHEIGHT"),
         (("--render", "--cameras", "none.yaml"), "cannot read the config none.yaml"),

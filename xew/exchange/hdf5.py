@@ -283,7 +283,7 @@ def _center_pixels(intrinsics: np.ndarray, scale: float) -> np.ndarray:
 
 
 def _world_to_camera(stored: np.ndarray, reading: int) -> np.ndarray:
-    """World to camera [4 4] m, from a matrix [3 4] or [4 4] of either direction, in OpenCV's or OpenGL's frame: readings 0 to 3."""
+    """World to camera [4 4] m, from a matrix [3 4] or [4 4] of either direction, in OpenCV's or OpenGL's frame (0 to 3)."""
     matrix = np.eye(4)
     matrix[:3] = stored[:3]
     direct = matrix if reading % 2 == 0 else np.linalg.inv(matrix)

@@ -21,7 +21,8 @@ from jaxtyping import Float, Float32, Shaped, UInt8
 from scipy.spatial.transform import Rotation
 
 from xew.config import ConfigError
-from xew.episode import Record, States, data_folder, read_pixels
+from xew.dataset import view_episode
+from xew.episode import EpisodeError, Record, States, data_folder, read_pixels, read_record, read_states
 from xew.model.video.frames import TEMPORAL_FACTOR
 from xew.protocol import ARMS, CAMERA_SIZE
 
@@ -56,6 +57,8 @@ class Command:
     """Function that reads the first frame of the scene [1 h w 3] uint8."""
     size: tuple[int, int] = CAMERA_SIZE
     """Width and height of the camera's picture [pixels]."""
+    parts: tuple["Command", ...] = ()
+    """The same commands in each view of a tiled picture, from top to bottom."""
 
     @cached_property
     def render(self) -> Video:
@@ -65,8 +68,11 @@ class Command:
     @cached_property
     def streams(self) -> "xew.sim_warp.rendering.streams.CommandStreams":
         """Render, mask and optical flow of the commands; imports Warp."""
-        from xew.sim_warp.rendering.streams import command_streams
+        from xew.sim_warp.rendering.streams import CommandStreams, command_streams
 
+        if self.parts:
+            names = ("render", "mask", "optical_flow")
+            return CommandStreams(*(np.concatenate([getattr(part.streams, name) for part in self.parts], 1) for name in names))
         return command_streams(self.robot_spec, self.action, self.camera)
 
     @cached_property
@@ -81,9 +87,9 @@ class Command:
         """The scene without the robot, where closed grippers carry objects of the first frame: [t h w 3] uint8."""
         from xew.model.video.carried_scene import View, carry
 
-        if self.extrinsics.ndim == 3:
+        if self.parts or self.extrinsics.ndim == 3:
             raise ConfigError(
-                "carried_render needs a camera that stands still, and the camera of this view moves with the robot; use "
+                "carried_render needs one camera that stands still, and this view is tiled or moves with the robot; use "
                 "--model.embodiment pasted_render or robot_render."
             )
         assert self.read_first is not None
@@ -191,7 +197,16 @@ def make_command(
     first = partial(read_pixels, folder, "rgb", most=1, record=record) if scene is None else partial(np.copy, scene[:1])
     extrinsics = _move_camera(record, states, data) if record.camera.moves else states.extrinsics
     size = states.robot_mask.shape[2], states.robot_mask.shape[1]
-    return Command(record.robot, states.action, states.intrinsics, extrinsics, render, rendered, data, first, size)
+    parts = tuple(_part_command(view_episode(folder, part)) for part in record.camera.parts)
+    return Command(record.robot, states.action, states.intrinsics, extrinsics, render, rendered, data, first, size, parts)
+
+
+def _part_command(folder: Path) -> Command:
+    """The command of a view that is part of a tiled picture. Raises EpisodeError if it is tiled itself."""
+    record = read_record(folder)
+    if record.camera.parts:
+        raise EpisodeError(f"{folder} is part of a tiled view and is tiled itself; delete it, or tile other views.")
+    return make_command(folder, record, read_states(folder, record))
 
 
 def _move_camera(record: Record, states: States, data: Path) -> Float[np.ndarray, "t 4 4"]:
@@ -259,7 +274,8 @@ def ray_map(command: Command) -> Video:
     """The commanded tool frames, drawn into the image: [t h w 3] uint8."""
     from xew.sim_warp.rendering import streams
 
-    return streams.ray_map(command.robot_spec, command.action, command.camera)
+    parts = command.parts or (command,)
+    return np.concatenate([streams.ray_map(part.robot_spec, part.action, part.camera) for part in parts], axis=1)
 
 
 def reference_image(command: Command) -> Video:
@@ -301,10 +317,12 @@ def tool_poses(command: Command) -> Poses:
 
 def camera(command: Command) -> Float[np.ndarray, "t 16"]:
     """The camera's 16 numbers (`mechanisms.CAMERA`) at every frame, for 320x240 pixels: [t 16] float32."""
-    if command.size[0] * CAMERA_SIZE[1] != command.size[1] * CAMERA_SIZE[0]:
-        raise ConfigError("the condition camera is of pictures of 4:3, such as 640x480; {}x{} is not.".format(*command.size))
+    if command.parts or command.size[0] * CAMERA_SIZE[1] != command.size[1] * CAMERA_SIZE[0]:
+        raise ConfigError("the condition camera is of one picture of 4:3, such as 640x480; {}x{} is not.".format(*command.size))
     frames = len(command.action)
-    k = command.intrinsics * CAMERA_SIZE[0] / command.size[0]
+    scale = CAMERA_SIZE[0] / command.size[0]
+    k = command.intrinsics * scale
+    k[:2, 2] += (scale - 1) / 2  # (0, 0) is the center of a pixel
     extrinsics = np.broadcast_to(command.extrinsics, (frames, 4, 4))
     rotation, offset = extrinsics[:, :3, :3], extrinsics[:, :3, 3]
     lens = np.tile([k[0, 0], k[1, 1], k[0, 2], k[1, 2]], (frames, 1))

@@ -3,6 +3,7 @@
 Reads  a run, or a config that names published weights; episodes
 Writes <out>/<task>/<seed>/<robot>/rgb.mkv (lossless, at the camera's size) and rollout.json
 
+Rollouts of a tiled view are also cut into <out>-views/<view>/, one tree for each of its views.
 Episodes are predicted in batches over all devices, in parallel with reading the next two batches and writing the previous one.
 Command: python -m xew.model.rollout RUN --data DATA --split test [--robots … --out … --rollout.steps …]
 """
@@ -26,8 +27,8 @@ from xew.command_line import find_path, parse_command
 from xew.compilation import keep_compiled_programs
 from xew.concurrency import map_in_order, usable_cores
 from xew.config import CONVERTER, ConfigError, admit, find_config, is_packaged, user_errors
-from xew.dataset import Episode, view_folder
-from xew.episode import Record, episode_folder, remove_left_overs
+from xew.dataset import Episode, view_episode, view_folder
+from xew.episode import Record, episode_folder, read_record, remove_left_overs
 from xew.files import hold_lock, read_json
 from xew.model.cache.scales import Scale, load_run_scales
 from xew.model.cache.store import load_codec
@@ -119,7 +120,7 @@ def rollout_header(experiment: Experiment, step: int | None, saved: int | None, 
 
     `step` and `saved` (`checkpoint_time`) identify the checkpoint; they are None for published weights.
     """
-    _, record = episode
+    folder, record = episode
     action, embodiment = experiment.model.action, experiment.model.embodiment
     header = common_header(
         experiment.out.name,
@@ -128,6 +129,8 @@ def rollout_header(experiment: Experiment, step: int | None, saved: int | None, 
         experiment.rollout.max_frames,
     )
     config = CONVERTER.unstructure(replace(experiment, rollout=replace(experiment.rollout, batch=0)))
+    if record.camera.parts:
+        header["views"] = {part: read_record(view_episode(folder, part)).hashes["rgb"] for part in record.camera.parts}
     return header | {"checkpoint_step": step, "checkpoint_saved": saved, "config": config}
 
 
@@ -171,7 +174,12 @@ class RolloutWriter:
 
     def _write(self, record: Record, video: np.ndarray, header: dict[str, Any]) -> Path:
         resized = video if self.resize is None else self.resize(video, record.camera.size)
-        return write_rollout(self.out, record.task, record.seed, record.robot, resized, header, record.frame_rate)
+        name = record.task, record.seed, record.robot
+        views, height = header.get("views", {}), resized.shape[1] // max(len(record.camera.parts), 1)
+        for number, (view, source) in enumerate(views.items()):
+            cut, own = resized[:, number * height : (number + 1) * height], header | {"source_hash": source}
+            write_rollout(self.out.with_name(f"{self.out.name}-views") / view, *name, cut, own, record.frame_rate)
+        return write_rollout(self.out, *name, resized, header, record.frame_rate)
 
     def _settle(self) -> None:
         self.waiting.popleft().result()

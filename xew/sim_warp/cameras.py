@@ -21,6 +21,8 @@ from xew.sim_warp.kinematics.forward import link_poses, tool_poses
 from xew.sim_warp.rendering.bodies import SIDES, body_names, robot_bodies, robot_pose
 from xew.sim_warp.rendering.streams import articulation_action, default_renderer, home_action
 
+TOOLS = ("left_tool", "right_tool")
+"""Names of the tools' frames, to which a camera can be fixed on every robot."""
 WRIST = CameraSpec("wrist", "left_tool", (-0.04, 0.0, 0.08), (0.03, 0.0, 0.0), vertical_fov=75.0)
 """A camera over the hand; `fix_camera` raises it above larger hands."""
 WRIST_CLEARANCE = 0.02
@@ -62,8 +64,8 @@ def get_camera(name: str, size: str | None = None) -> CameraSpec:
         check_name(spec.name, "name of a camera")
     except EpisodeError as error:
         raise ConfigError(str(error)) from error
-    if spec.problem:
-        raise ConfigError(f"{name}: {spec.problem}.")
+    if problem := "its name has a +, as tiled views have" if spec.parts else spec.problem:
+        raise ConfigError(f"{name}: {problem}.")
     parse_size("{}x{}".format(*spec.size))
     return spec
 
@@ -144,9 +146,6 @@ def fixed_frames(spec: CameraSpec, robot: RobotSpec, joint_pos: np.ndarray) -> n
         )
     copy, link = links[spec.fixed_to]
     return matrix_from_pose(link_poses(robot, joint_pos)[copy][link])
-
-
-TOOLS = ("left_tool", "right_tool")
 
 
 def _tool_frames(robot: RobotSpec, tool: str, joint_pos: np.ndarray) -> np.ndarray:

@@ -243,6 +243,8 @@ def main() -> None:
     args = tyro.cli(Args, description=__doc__)
     print(f"device: {', '.join(device.name for device in find_devices(args.device))}")
     views = get_views(args.cameras, args.size)
+    if views and args.states_only:
+        raise EpisodeError("--cameras makes videos, and --states-only stores none; add views by inspect --render --cameras.")
     if views:
         demand_sight(views, [get_robot(name, args.folder) for name in expand_robots(args.robots)])
     with hold_lock(args.folder):

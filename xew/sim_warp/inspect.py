@@ -17,14 +17,14 @@ from typing import Annotated
 import tyro
 
 from xew.config import admit, user_errors
-from xew.dataset import explain_missing, folder_beside, list_views, read_dataset, view_folder
-from xew.episode import EpisodeError, Record
+from xew.dataset import base_data, explain_missing, folder_beside, list_views, read_dataset, view_folder
+from xew.episode import EpisodeError, Record, read_record
 from xew.files import hold_lock
 from xew.names import plain_line
 from xew.protocol import HEAD, seed_split
 from xew.sim_warp.cameras import get_views
 from xew.sim_warp.devices.workers import quiet_warp
-from xew.sim_warp.inspection.checks import render_changes, render_videos, render_views, rerender, verify
+from xew.sim_warp.inspection.checks import render_changes, render_videos, render_views, rerender, tile_views, verify
 from xew.sim_warp.inspection.explorer import Page, choose_scenes, find_predictions, write_page
 from xew.sim_warp.inspection.pictures import draw_grid, draw_pictures
 from xew.sim_warp.inspection.visibility import visibility_section
@@ -56,6 +56,8 @@ class Args:
     """Cameras whose views --render adds: head, wrist_left, wrist_right, front, side, or YAML files (docs/cameras.md)."""
     size: str | None = None
     """Size of these views, such as 640x480; default: the camera's."""
+    tile: tuple[str, ...] = ()
+    """Views that --render tiles into one picture, from top to bottom, as the view head+wrist_left."""
     views: tuple[str, ...] = (HEAD,)
     """Views on --pictures and --page, side by side. A view is a data set too: inspect DATA/views/wrist_left."""
     pictures: Path | None = None
@@ -100,8 +102,8 @@ def main() -> None:
     if args.visibility:
         show_visibility([folder for folder, _ in pictured], args)
     if args.rerender:
-        rerender(stored, args.rerender)
-    if args.render or args.cameras:
+        rerender([folder for folder in stored if not read_record(folder).camera.parts], args.rerender)
+    if args.render or args.cameras or args.tile:
         render(pictured, args)
     if args.pictures:
         with hold_lock(args.pictures):
@@ -128,7 +130,11 @@ def list_stored_views(data: Path, damaged: list[str]) -> list[Path]:
 def render(cells: list[tuple[Path, Record]], args: Args) -> None:
     """Make missing videos and the views of --cameras; with --change of another data set, which is made first."""
     if not args.render:
-        raise EpisodeError(f"--cameras {' '.join(args.cameras)} names views to make; add --render.")
+        raise EpisodeError(f"{' '.join(args.cameras or args.tile)}: views are made by --render; add it.")
+    if (base := base_data(args.data)) != args.data:
+        raise EpisodeError(f"{args.data} is a view; add views to its data set: {base}.")
+    if len(args.tile) == 1:
+        raise EpisodeError(f"--tile {args.tile[0]} is one view, expected at least two.")
     views = get_views(args.cameras, args.size)
     with hold_lock(args.out or args.data):
         if args.out:
@@ -139,6 +145,8 @@ def render(cells: list[tuple[Path, Record]], args: Args) -> None:
             cells = list(read_dataset(args.out).accepted)
         render_videos([folder for folder, record in cells if not record.videos])
         render_views(cells, views)
+        if args.tile:
+            tile_views(cells, args.tile)
 
 
 def show_visibility(folders: list[Path], args: Args) -> None:

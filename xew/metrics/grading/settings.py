@@ -26,8 +26,6 @@ class Args:
     """Rollout trees; several are graded into one table."""
     data: Path = Path("data")
     """The data set that holds the true episodes."""
-    view: str = HEAD
-    """View of the data set that the rollouts predict, such as wrist_left."""
     out: Path = Path("scores.parquet")
     """Score table; all other files lie next to it."""
     metrics: tuple[str, ...] = tuple(METRICS)
@@ -72,6 +70,8 @@ class Args:
     """With --check: grade this number of its videos again and compare."""
     trust: tuple[str, ...] = ()
     """Modules with custom tasks and robots, such as my_lab.tasks, that the data may name."""
+    view: str = HEAD
+    """View of the data set that the rollouts predict, such as wrist_left."""
 
 
 @dataclass(frozen=True)

@@ -48,7 +48,7 @@ def to_model_size(video: np.ndarray, height: int, width: int) -> np.ndarray:
 
 def to_camera_size(video: np.ndarray, size: Size = CAMERA_SIZE) -> np.ndarray:
     """Model frames uint8 [t h w 3] -> frames of the camera's size, [t 240 320 3] for the head camera."""
-    top, bottom, left, right = padding_to(*video.shape[1:3], size)
+    top, bottom, left, right = padding_to(video.shape[1], video.shape[2], size)
     height, width = size[1] + top + bottom, size[0] + left + right
     if video.shape[1:3] != (height, width):
         video = np.stack([cv2.resize(frame, (width, height), interpolation=cv2.INTER_CUBIC) for frame in video])

@@ -15,7 +15,7 @@ from xew.protocol import RANDOM_CHANGE, CameraSpec
 from xew.sim_warp.cameras import demand_sight
 from xew.sim_warp.changes.scenes import check_change
 from xew.sim_warp.devices.workers import Workers, find_devices, worker_count
-from xew.sim_warp.production.rerender import add_videos, add_view, demand_plausible, render_again, render_changed
+from xew.sim_warp.production.rerender import add_tiled, add_videos, add_view, demand_plausible, render_again, render_changed
 from xew.sim_warp.production.warm_up import compile_kernels
 from xew.sim_warp.rendering.render import Renderer
 from xew.sim_warp.robots import recorded_robot
@@ -73,6 +73,12 @@ def render_views(cells: Sequence[Episode], specs: Sequence[CameraSpec]) -> None:
     for spec in specs:
         made = _render_all(partial(_render_view, spec=spec), [folder for folder, _ in cells])
         print(f"view {spec.view}: {sum(made)} of {len(cells)} episodes new")
+
+
+def tile_views(cells: Sequence[Episode], views: Sequence[str]) -> None:
+    """Make and store the view that tiles others into one picture. Raises EpisodeError as `add_tiled`."""
+    made = [add_tiled(folder, views) for folder, _ in tqdm(cells, desc="tiling", unit="episode")]
+    print(f"view {'+'.join(views)}: {sum(made)} of {len(cells)} episodes new")
 
 
 def _render_all(render: Callable[[Path], Result], folders: list[Path]) -> list[Result]:

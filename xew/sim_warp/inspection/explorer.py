@@ -23,7 +23,7 @@ from xew.protocol import HEAD
 from xew.rollout import Rollout, find_rollouts, read_as_graded
 from xew.sim_warp.inspection.films import Row, difference_video, tile_frames, tile_size, write_film
 from xew.sim_warp.inspection.overlays import frame_psnr, overlay_data
-from xew.sim_warp.inspection.pictures import to_height
+from xew.sim_warp.inspection.pictures import fit_picture
 from xew.sim_warp.robots import ROBOTS, recorded_robot
 
 __all__ = ["Page", "Predictions", "Scene", "choose_scenes", "find_predictions", "write_page"]
@@ -231,8 +231,7 @@ def _write_films(stem: str, scene: Scene, page: Page, rows: dict[str, Row], out:
 
 def _fit(video: np.ndarray, other: np.ndarray) -> np.ndarray:
     """A video [t h w 3] that fits into the size of another one."""
-    height = min(other.shape[1], video.shape[1] * other.shape[2] // video.shape[2])
-    return np.stack([to_height(frame, height) for frame in video])
+    return np.stack([fit_picture(frame, *other.shape[1:3]) for frame in video])
 
 
 def _flow(cell: Episode, states: States) -> np.ndarray:

@@ -91,9 +91,14 @@ def _column(cells: list[tuple[Path, Record]], robots: list[str]) -> np.ndarray:
     """A task's name over one picture per robot: [h w 3] uint8."""
     folders = {record.robot: folder for folder, record in cells}
     instants = dict(zip(folders, busy_instants([read_states(folder).contact for folder in folders.values()]), strict=True))
-    images = [_halve(read_pixels(folders[robot], "rgb")[instants[robot]]) if robot in folders else BLANK for robot in robots]
+    images = [_small(folders[robot], instants[robot]) if robot in folders else BLANK for robot in robots]
     name = cells[0][1].task.rsplit(":", 1)[-1]
     return np.concatenate([_label(name, WIDTH // 2 + GAP), tile([[image] for image in images])])
+
+
+def _small(folder: Path, instant: int) -> np.ndarray:
+    """A frame of an episode at half the head camera's size."""
+    return fit_picture(read_pixels(folder, "rgb")[instant], HEIGHT // 2, WIDTH // 2)
 
 
 def busy_instants(contacts: list[np.ndarray]) -> list[int]:
@@ -120,14 +125,12 @@ def _label(text: str, width: int, height: int = LABEL_HEIGHT) -> np.ndarray:
     return cv2.putText(image, text, place, cv2.FONT_HERSHEY_SIMPLEX, scale, (40, 40, 40), 1, cv2.LINE_AA)
 
 
-def to_height(image: np.ndarray, height: int = HEIGHT) -> np.ndarray:
-    """An image [h w 3] at another height and the same aspect ratio."""
-    width = round(image.shape[1] * height / len(image))
-    return image if len(image) == height else cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
-
-
-def _halve(image: np.ndarray) -> np.ndarray:
-    return cv2.resize(image, (image.shape[1] // 2, image.shape[0] // 2), interpolation=cv2.INTER_AREA)
+def fit_picture(image: np.ndarray, height: int = HEIGHT, width: int = WIDTH) -> np.ndarray:
+    """An image [h w 3] brought to a size with its aspect ratio, and white at the right or below."""
+    scale = min(height / image.shape[0], width / image.shape[1])
+    inner = round(image.shape[1] * scale), round(image.shape[0] * scale)
+    resized = cv2.resize(image, inner, interpolation=cv2.INTER_AREA)
+    return np.pad(resized, ((0, height - inner[1]), (0, width - inner[0]), (0, 0)), constant_values=255)
 
 
 def contact_sheet(cells: list[tuple[Path, Record]], views: Sequence[str] = (HEAD,)) -> np.ndarray:
@@ -135,7 +138,7 @@ def contact_sheet(cells: list[tuple[Path, Record]], views: Sequence[str] = (HEAD
     rows = []
     for folder, _ in cells:
         videos = [read_pixels(view_episode(folder, view), "rgb") for view in views]
-        rows.append([to_height(video[round(time * (len(video) - 1))]) for video in videos for time in SHEET_TIMES])
+        rows.append([fit_picture(video[round(time * (len(video) - 1))]) for video in videos for time in SHEET_TIMES])
     names = np.concatenate([_label(record.robot, LABEL_WIDTH, HEIGHT + GAP) for _, record in cells])
     pictures = np.concatenate([names, tile(rows)], 1)
     record = cells[0][1]

@@ -1,11 +1,12 @@
 """Re-rendering of episodes from recorded states: missing videos and other views; and the plausibility check of motion."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from xew.dataset import VIEWS
+from xew.dataset import VIEWS, view_episode
 from xew.episode import (
     EpisodeError,
     Record,
@@ -15,6 +16,7 @@ from xew.episode import (
     demand_known,
     episode_folder,
     place_episode,
+    read_pixels,
     read_record,
     read_states,
     states_hash,
@@ -47,6 +49,8 @@ def render_again(folder: Path, renderer: Renderer) -> tuple[np.ndarray, np.ndarr
         EpisodeError: the scene or a hash differs from the recorded one.
     """
     record = read_record(folder)
+    if record.camera.parts:
+        raise EpisodeError(f"{folder} is tiled of {', '.join(record.camera.parts)}; render these again instead.")
     robot = recorded_robot(record.robot, data_folder(folder))
     demand_known(folder, "joint_pos", "object_pose")
     scene = _sample_again(folder, record)
@@ -113,6 +117,31 @@ def _shows(folder: Path, spec: CameraSpec, states: States) -> bool:
     seen = read_states(folder, record)
     same = (np.array_equal(getattr(seen, name), getattr(states, name)) for name in ("action", "joint_pos", "object_pose"))
     return record.camera == spec and record.videos and all(same)
+
+
+def add_tiled(folder: Path, views: Sequence[str]) -> bool:
+    """Write the view that tiles others into one picture, from top to bottom; returns whether it was missing.
+
+    Its camera, keypoints and objects are the first view's, which is at the upper left; videos and mask are of all.
+
+    Raises:
+        EpisodeError: the episode lacks a view, or the views have several sizes.
+    """
+    parts = [view_episode(folder, view) for view in views]
+    records = [read_record(part) for part in parts]
+    sizes = {record.camera.size for record in records}
+    if len(sizes) > 1 or any(record.camera.parts for record in records):
+        raise EpisodeError(f"{folder}: the views {', '.join(views)} have the sizes {sorted(sizes)}; tile cameras of one size.")
+    first, ((width, height),) = records[0], sizes
+    root = path_below(data_folder(folder), VIEWS, "+".join(views))
+    if (episode_folder(root, first.task, first.seed, first.robot) / "episode.json").exists():
+        return False
+    states = [read_states(part) for part in parts]
+    seen = replace(states[0], robot_mask=np.concatenate([of_part.robot_mask for of_part in states], axis=1))
+    rgb, robot = (np.concatenate([read_pixels(part, name) for part in parts], axis=1) for name in ("rgb", "robot"))
+    camera = replace(first.camera, name="+".join(views), size=(width, height * len(views)))
+    write_episode(root, replace(first, camera=camera), seen, rgb, robot)
+    return True
 
 
 def render_changed(folder: Path, name: str, out: Path, renderer: Renderer) -> Record:

@@ -57,8 +57,8 @@ def read_surfaces(folder: Path, keep: Path | None = None) -> SurfaceTracks | Non
     """Surface tracks of an accepted episode, read from or written to the store `keep`, if given.
 
     Returns:
-        None if the shapes are unknown: the episode was imported, its task now makes another scene of its seed, or its task or
-        robot does not exist.
+        None if the shapes are unknown: the episode was imported, its task now makes another scene of its seed, its task or
+        robot does not exist, or several views are tiled into one picture.
 
     Raises:
         EpisodeError: a file is missing or damaged.
@@ -66,7 +66,7 @@ def read_surfaces(folder: Path, keep: Path | None = None) -> SurfaceTracks | Non
     """
     record = read_record(folder)
     try:
-        scene = None if record.source else _find_scene(record)
+        scene = None if record.source or record.camera.parts else _find_scene(record)
         robot = recorded_robot(record.robot, data_folder(folder))
     except UntrustedError:
         raise

@@ -1,5 +1,7 @@
 """Camera, lights and shading of the stage as arguments of the kernels."""
 
+from typing import Any
+
 import numpy as np
 import warp as wp
 
@@ -15,7 +17,8 @@ SHADOW_SIZE = 512
 def camera_views(camera: Camera, frames: np.ndarray) -> np.ndarray:
     """The camera as an argument of the kernels, `raster_kernels.View` by field: [n] at frames [n] if it moves, else [1]."""
     extrinsics = camera.extrinsics[frames] if camera.moves else camera.extrinsics[None]
-    views = np.zeros(len(extrinsics), raster.View.numpy_dtype())
+    fields: Any = raster.View
+    views: Any = np.zeros(len(extrinsics), fields.numpy_dtype())
     views["rotation"], views["translation"] = extrinsics[:, :3, :3], extrinsics[:, :3, 3]
     views["focal"], views["center"] = camera.intrinsics[[0, 1], [0, 1]], camera.intrinsics[:2, 2]
     views["near"] = raster.NEAR_OF_MOVING if camera.moves else raster.NEAR
