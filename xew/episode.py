@@ -331,7 +331,8 @@ def _check_record(record: Record) -> Record:
         raise ValueError(record.camera.problem)
     if record.motion not in MOTIONS:
         raise ValueError(f"its motion is {record.motion!r}, expected {' or '.join(MOTIONS)}")
-    parse_change(record.change)
+    if record.change != (change := str(parse_change(record.change) or "")):
+        raise ValueError(f"its change is {record.change!r}, expected {change!r}")
     if not SLOWEST <= record.frame_rate <= FASTEST or record.frame_count < 0:
         raise ValueError(f"it has {record.frame_count} frames at {record.frame_rate} a second")
     return record

@@ -1,5 +1,6 @@
 """One change at a time: what it changes, that it changes nothing else, and how wrong requests are refused."""
 
+import json
 import shutil
 import sys
 from collections.abc import Callable
@@ -195,6 +196,15 @@ def test_what_is_no_change_is_refused_in_one_line(change: str, tmp_path: Path) -
     with pytest.raises(EpisodeError, match=r"is no change, expected light, background.* from 0 to 99.*, or random\.$") as at:
         generate.generate(generate.Args((TASK,), out=tmp_path / "data", change=change))
     assert "\n" not in str(at.value) and not (tmp_path / "data").exists()
+
+
+def test_a_header_names_a_change_in_one_way(data: Callable[[str], Path], tmp_path: Path) -> None:
+    folder = episode_folder(Path(shutil.copytree(data("light:3"), tmp_path / "data")), TASK, 0, "piper")
+    header = json.loads((folder / "episode.json").read_text())
+    for change, problem in (("light:03", "its change is 'light:03', expected 'light:3'"), ("lamp:3", "'lamp:3' is no change")):
+        (folder / "episode.json").write_text(json.dumps(header | {"change": change}))
+        with pytest.raises(EpisodeError, match=problem):
+            read_record(folder)
 
 
 def test_changed_and_unchanged_scenes_are_not_mixed(data: Callable[[str], Path], tmp_path: Path) -> None:
