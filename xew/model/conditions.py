@@ -71,8 +71,10 @@ class Command:
         from xew.sim_warp.rendering.streams import CommandStreams, command_streams
 
         if self.parts:
-            names = ("render", "mask", "optical_flow")
-            return CommandStreams(*(np.concatenate([getattr(part.streams, name) for part in self.parts], 1) for name in names))
+            tiled = (
+                np.concatenate([getattr(p.streams, name) for p in self.parts], axis=1) for name in ("mask", "optical_flow")
+            )
+            return CommandStreams(self.render, *tiled)
         return command_streams(self.robot_spec, self.action, self.camera)
 
     @cached_property
