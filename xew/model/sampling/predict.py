@@ -147,8 +147,8 @@ class Predictor:
         inputs, (folder, record), clip = self.inputs, episode, self.inputs.clip
         names = [name for name, condition in inputs.conditions.items() if condition.make is not None]
         pixels = stored_pixels(folder, record, needed_pixels(inputs.conditions, names))
-        command = episode_command(folder, record, pixels.get("robot"), pixels.get("rgb"))
         given = {FIRST: read_pixels(folder, "rgb", most=1, record=record)}
+        command = episode_command(folder, record, pixels.get("robot"), given[FIRST])
         if gives_render(self.codec, inputs.conditions):
             scene = command.carried_scene if shows_carried(inputs.conditions.values()) else given[FIRST]
             given |= {RENDER: pixels["robot"], SCENE: scene}
