@@ -104,6 +104,7 @@ class Renderer:
         depth: bool = False,
         body: bool = False,
         optical_flow: bool = False,
+        colors: bool = True,
     ) -> list[Frames]:
         """Render worlds of any length and content.
 
@@ -111,6 +112,7 @@ class Renderer:
             camera: of all worlds; one that moves has a pose for each frame of all worlds, in order.
             ground: True for table, wall, ground and shadows; False for the bodies alone on white, without shadows.
             depth, body, optical_flow: requests for the optional images of `Frames`.
+            colors: whether to make `rgb`.
 
         Raises:
             ValueError: poses or points do not fit, or are not finite.
@@ -121,7 +123,7 @@ class Renderer:
         optional = {"depth": depth, "body": body, "optical_flow": optical_flow}
         wanted = frozenset(name for name, asked_for in optional.items() if asked_for)
         with PARSING:  # threads share the device's buffers and modules
-            return _split_by_world(self._render_worlds(worlds, camera, ground, wanted), worlds)
+            return _split_by_world(self._render_worlds(worlds, camera, ground, wanted, colors), worlds)
 
     def probe_batch(self, worlds: Sequence[World], camera: Camera = HEAD_CAMERA) -> list[Frames]:
         """As `render_batch` with stage, bodies and depth, but without `rgb`, for worlds with points.
