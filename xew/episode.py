@@ -363,7 +363,7 @@ def read_states(folder: Path, record: Record | None = None) -> States:
         file = load_file(path)
         record = record or read_record(folder)
         arrays = read_npz(file)
-        arrays["robot_mask"] = np.unpackbits(arrays["robot_mask"], axis=-1).astype(bool)
+        arrays["robot_mask"] = np.unpackbits(arrays["robot_mask"], axis=-1).view(bool)
         states = States(**arrays)
         _check_states(states, record)
     except FileNotFoundError as error:

@@ -16,6 +16,7 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Shaped, UInt8
 from scipy.spatial.transform import Rotation
@@ -67,13 +68,15 @@ class Command:
 
     @cached_property
     def streams(self) -> "xew.sim_warp.rendering.streams.CommandStreams":
-        """Render, mask and optical flow of the commands; imports Warp."""
+        """Mask and optical flow of the commands; imports Warp."""
         from xew.sim_warp.rendering.streams import CommandStreams, command_streams
 
         if self.parts:
-            names = ("render", "mask", "optical_flow")
-            return CommandStreams(*(np.concatenate([getattr(part.streams, name) for part in self.parts], 1) for name in names))
-        return command_streams(self.robot_spec, self.action, self.camera)
+            names = ("mask", "optical_flow")
+            return CommandStreams(
+                self.render, *(np.concatenate([getattr(part.streams, name) for part in self.parts], axis=1) for name in names)
+            )
+        return command_streams(self.robot_spec, self.action, self.camera, colors=False)
 
     @cached_property
     def tools(self) -> Float[np.ndarray, "t 2 7"]:
@@ -190,9 +193,13 @@ def clip_numbers(
 
 
 def make_command(
-    folder: Path, record: Record, states: States, rendered: Video | None = None, scene: Video | None = None
+    folder: Path,
+    record: Record,
+    states: States,
+    rendered: Video | None = None,
+    scene: UInt8[np.ndarray, "n h w 3"] | None = None,
 ) -> Command:
-    """The command of an episode; videos [t h w 3] as in `episodes.commands.episode_command`."""
+    """The command of an episode; videos [t h w 3] and [n h w 3] as in `episodes.commands.episode_command`."""
     render, data = folder / "robot.mkv", data_folder(folder)
     first = partial(read_pixels, folder, "rgb", most=1, record=record) if scene is None else partial(np.copy, scene[:1])
     extrinsics = _move_camera(record, states, data) if record.camera.moves else states.extrinsics
@@ -260,7 +267,9 @@ def shows_carried(conditions: Iterable[Condition]) -> bool:
 
 def robot_mask(command: Command) -> Video:
     """The robot's silhouette at every frame, white on black: [t h w 3] uint8."""
-    return np.repeat(command.streams.mask[..., None], 3, axis=-1).astype(np.uint8) * 255
+    mask = command.streams.mask
+    rows = mask.reshape(-1, mask.shape[-1]).view(np.uint8) * 255  # all frames below each other, for one call of OpenCV
+    return cv2.cvtColor(rows, cv2.COLOR_GRAY2RGB).reshape(*mask.shape, 3)
 
 
 def optical_flow(command: Command) -> Video:

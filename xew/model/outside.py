@@ -25,7 +25,8 @@ from xew.episode import read_pixels, read_record, remove_left_overs
 from xew.files import hold_lock
 from xew.model.episodes.choice import select_episodes
 from xew.model.episodes.commands import episode_command
-from xew.model.rollout import RolloutWriter, check_out, common_header, is_done
+from xew.model.rollout import check_out, common_header, is_done
+from xew.model.sampling.writing import RolloutWriter
 from xew.protocol import HEAD, LEFT_GRIPPER, RIGHT_GRIPPER
 
 

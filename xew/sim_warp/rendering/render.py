@@ -106,6 +106,7 @@ class Renderer:
         depth: bool = False,
         body: bool = False,
         optical_flow: bool = False,
+        colors: bool = True,
     ) -> list[Frames]:
         """Render worlds of any length and content.
 
@@ -114,6 +115,7 @@ class Renderer:
             ground: True for table, wall, ground and shadows; False for the bodies alone on white, without shadows.
             stage: table, wall, ground and lights of all worlds; without the ground the light is the standard one.
             depth, body, optical_flow: requests for the optional images of `Frames`.
+            colors: whether to make `rgb`.
 
         Raises:
             ValueError: poses or points do not fit, or are not finite.
@@ -124,7 +126,7 @@ class Renderer:
         optional = {"depth": depth, "body": body, "optical_flow": optical_flow}
         wanted = frozenset(name for name, asked_for in optional.items() if asked_for)
         with PARSING:  # threads share the device's buffers and modules
-            return _split_by_world(self._render_worlds(worlds, camera, stage if ground else None, wanted), worlds)
+            return _split_by_world(self._render_worlds(worlds, camera, stage if ground else None, wanted, colors), worlds)
 
     def probe_batch(self, worlds: Sequence[World], camera: Camera = HEAD_CAMERA, stage: Stage = STANDARD) -> list[Frames]:
         """As `render_batch` with stage, bodies and depth, but without `rgb`, for worlds with points.
