@@ -14,7 +14,7 @@ from pathlib import Path
 
 from xew.episode import TEMPORARY, EpisodeError, Record, data_folder, exact_rate, read_record
 from xew.names import check_name, folder_name
-from xew.protocol import HEAD, MOTIONS, seed_split
+from xew.protocol import HEAD, MOTIONS, RANDOM_CHANGE, seed_split
 
 Episode = tuple[Path, Record]
 """Folder and header of one cell."""
@@ -148,6 +148,18 @@ def demand_one_motion(data: Path, records: Iterable[Record]) -> str:
     if len(counts) > 1:
         raise EpisodeError(f"{data} has {_list_motions(counts)}, which cannot be compared; keep them in separate data sets.")
     return next(iter(counts), MOTIONS[0])
+
+
+def demand_one_change(data: Path, records: Iterable[Record]) -> str:
+    """The change of a data set's episodes: empty, one, or RANDOM_CHANGE. Raises EpisodeError if only some have a change."""
+    counts = Counter(record.change for record in records)
+    if len(counts) > 1 and "" in counts:
+        changed = ", ".join(sorted(change for change in counts if change)[:3])
+        raise EpisodeError(
+            f"{data} has {counts['']} unchanged episodes and {counts.total() - counts['']} with a change ({changed}), which "
+            "cannot be compared; keep them in separate data sets."
+        )
+    return RANDOM_CHANGE if len(counts) > 1 else next(iter(counts), "")
 
 
 def demand_one_rate(data: Path, records: Iterable[Record]) -> Fraction:

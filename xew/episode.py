@@ -38,7 +38,7 @@ from xew.config import ConfigError, parse
 from xew.files import LoadedFile, check_place, file_digest, load_file, read_json, sweep
 from xew.names import EpisodeError as EpisodeError
 from xew.names import check_label, check_name, folder_name, name_of_folder, path_below
-from xew.protocol import CAMERA_SIZE, FRAME_RATE, HEAD_SPEC, MOTIONS, SHARED_MOTION, CameraSpec
+from xew.protocol import CAMERA_SIZE, FRAME_RATE, HEAD_SPEC, MOTIONS, SHARED_MOTION, CameraSpec, parse_change
 
 SCHEMA_VERSION = 2
 WIDTH, HEIGHT = CAMERA_SIZE
@@ -154,6 +154,8 @@ class Record:
     """Whether rgb and robot are stored. If not, `python -m xew.sim_warp.inspect --render` renders them."""
     motion: str = SHARED_MOTION
     """Kind of motion, one of `xew.protocol.MOTIONS`."""
+    change: str = ""
+    """The scene's one change as `FACTOR:LEVEL` (`xew.protocol.parse_change`); empty for an unchanged scene."""
     files: dict[str, str] = field(default_factory=dict)
     """SHA-256 of the files as they were written, by name. The decoded bytes of such a file need not be compared."""
     camera: CameraSpec = HEAD_SPEC
@@ -329,6 +331,8 @@ def _check_record(record: Record) -> Record:
         raise ValueError(record.camera.problem)
     if record.motion not in MOTIONS:
         raise ValueError(f"its motion is {record.motion!r}, expected {' or '.join(MOTIONS)}")
+    if record.change != (change := str(parse_change(record.change) or "")):
+        raise ValueError(f"its change is {record.change!r}, expected {change!r}")
     if not SLOWEST <= record.frame_rate <= FASTEST or record.frame_count < 0:
         raise ValueError(f"it has {record.frame_count} frames at {record.frame_rate} a second")
     return record

@@ -100,6 +100,16 @@ MOTIONS = (SHARED_MOTION, OWN_MOTION)
 """Kinds of motion. Shared: all robots of a scene follow one tool path on one clock; only the body differs. Own: each robot
 moves between the task's waypoints on its own path, in its own time and from its own rest posture."""
 
+FACTORS = ("light", "background", "table", "clutter", "height", "camera")
+"""Factors of a scene, of which a change concerns one; everything else stays the same."""
+STRENGTHS = 3
+"""Number of strengths of a change, each stronger than the previous one."""
+MOST_LEVEL = 99
+"""Largest level of a change. Levels 1 to 3 grow in strength and are for grading. Each further three are another draw of these
+strengths. `RANDOM_CHANGE` draws from level 4 on, so training never shows a graded level."""
+RANDOM_CHANGE = "random"
+"""Name of the change that is drawn for each scene, as a function of task and seed."""
+
 FRAME_RATE = 1000 / 60
 """Number of stored frames per second [Hz]: one every 15 physics steps of 4 ms."""
 TASK_COUNT = 25
@@ -190,9 +200,50 @@ def validation_split(split: Split) -> Split:
     return replace(split, held_out_robots=VALIDATION_BODIES)
 
 
-def split_key(split: str, motion: str) -> str:
-    """The key of a split in a kind of motion: fixed, fixed_own."""
-    return split if motion == SHARED_MOTION else f"{split}_{motion}"
+@dataclass(frozen=True)
+class Change:
+    """One factor of a scene at a level; level 0 leaves the scene unchanged."""
+
+    factor: str
+    level: int
+
+    @property
+    def strength(self) -> int:
+        """1, 2 or 3."""
+        return (self.level - 1) % STRENGTHS + 1
+
+    @property
+    def draw(self) -> int:
+        """The number of the draw that determines direction, color or pattern, the same for three strengths."""
+        return (self.level - 1) // STRENGTHS
+
+    def __str__(self) -> str:
+        return f"{self.factor}:{self.level}"
+
+
+SHIFTS = tuple(str(Change(factor, level)) for factor in FACTORS for level in range(1, STRENGTHS + 1))
+"""Changes of the protocol of shifts: each factor at the three graded levels."""
+
+
+def parse_change(text: str) -> Change | None:
+    """The change that a text such as `light:2` names; None for no change: an empty text or level 0.
+
+    Raises:
+        ValueError: it names no factor, or a level out of range.
+    """
+    if not text:
+        return None
+    factor, _, level = text.partition(":")
+    if factor not in FACTORS or not re.fullmatch("[0-9]{1,9}", level) or int(level) > MOST_LEVEL:
+        factors = f"{', '.join(FACTORS[:-1])} or {FACTORS[-1]}"
+        raise ValueError(f"{text!r} is no change, expected {factors} with a level from 0 to {MOST_LEVEL}, such as light:2")
+    return Change(factor, int(level)) if int(level) else None
+
+
+def split_key(split: str, motion: str, change: str = "") -> str:
+    """The key of a split or data set in a kind of motion, with a change: fixed, fixed_own, data_light_2."""
+    own, changed = motion if motion != SHARED_MOTION else "", change.replace(":", "_")
+    return "_".join(part for part in (split, own, changed) if part)
 
 
 _SHARED_SPLITS = (
@@ -313,6 +364,8 @@ PARTS: dict[str, tuple[Variant, ...]] = {
     "bodies": (reference("scaling_seen", embodiment="robot_render"),),
     # With the conditions of the LOEO folds.
     "halves": tuple(reference(split, *MULTI_VIEW) for split in HALVES),
+    # The recommended model, graded on changed scenes (`Study.changes`) as well.
+    "shifts": (reference(action="mask_and_flow_channels", embodiment="pasted_render"),),
 }
 """Variants that each table compares, in the order of its rows. A variant may be in several parts."""
 PAPER_PARTS = ("fixed", "actions", "ladder", "loeo", "few_shot", "forgetting", "baselines")

@@ -6,7 +6,7 @@ Writes a table to the terminal and, with options, pictures: a sheet per seed (st
        with the robots' synchronized videos, overlays and predictions (`inspection/explorer.py`)
 
 Command: python -m xew.sim_warp.inspect data [--verify] [--visibility] [--rerender 5] [--pictures sheets]
-         [--render [--cameras head wrist_left --size 640x480]]
+         [--render [--cameras head wrist_left --size 640x480] [--change light:2 --out NEW]]
          [--grid grid.png] [--page explorer [--scenes open_laptop stack_bowls_two/0] [--rollouts rollouts/fixed]]
 """
 
@@ -21,10 +21,10 @@ from xew.dataset import base_data, explain_missing, folder_beside, list_views, r
 from xew.episode import EpisodeError, Record, read_record
 from xew.files import hold_lock
 from xew.names import plain_line
-from xew.protocol import HEAD
+from xew.protocol import HEAD, seed_split
 from xew.sim_warp.cameras import get_views
 from xew.sim_warp.devices.workers import quiet_warp
-from xew.sim_warp.inspection.checks import render_videos, render_views, rerender, tile_views, verify
+from xew.sim_warp.inspection.checks import render_changes, render_videos, render_views, rerender, tile_views, verify
 from xew.sim_warp.inspection.explorer import Page, choose_scenes, find_predictions, write_page
 from xew.sim_warp.inspection.pictures import draw_grid, draw_pictures
 from xew.sim_warp.inspection.visibility import visibility_section
@@ -46,6 +46,12 @@ class Args:
     """Number of episodes to render again from their states and compare with the recorded hashes."""
     render: bool = False
     """Make and store the videos of episodes that were generated with --states-only, and the views of --cameras."""
+    change: str = ""
+    """With --render and --out: write the data set with this change, such as light:2, from its states without physics."""
+    out: Path | None = None
+    """Folder of the changed data set."""
+    split: str | None = None
+    """Family of seeds of the changed data set: train, validation, test or final; default: all."""
     cameras: tuple[str, ...] = ()
     """Cameras whose views --render adds: head, wrist_left, wrist_right, front, side, or YAML files (docs/cameras.md)."""
     size: str | None = None
@@ -79,6 +85,7 @@ def main() -> None:
     quiet_warp()
     args = tyro.cli(Args, description=__doc__)
     admit(args.trust)
+    check_change_options(args)
     cells, damaged = read_headers(args.data)
     print(yield_table([record for _, record in cells]))
     for folder, record in cells:
@@ -108,6 +115,12 @@ def main() -> None:
         make_page(pictured, args)
 
 
+def check_change_options(args: Args) -> None:
+    """Raise EpisodeError if only some of --render, --change and --out are given."""
+    if (args.change or args.out) and not (args.render and args.change and args.out):
+        raise EpisodeError("--change needs --render and --out, such as --render --change light:2 --out data_light_2.")
+
+
 def list_stored_views(data: Path, damaged: list[str]) -> list[Path]:
     """Episodes of all views besides `head`; messages of unreadable ones are added to `damaged`."""
     roots = [view_folder(data, view) for view in list_views(data)]
@@ -115,7 +128,7 @@ def list_stored_views(data: Path, damaged: list[str]) -> list[Path]:
 
 
 def render(cells: list[tuple[Path, Record]], args: Args) -> None:
-    """Make missing videos, and the views of --cameras."""
+    """Make missing videos and the views of --cameras; with --change of another data set, which is made first."""
     if not args.render:
         raise EpisodeError(f"{' '.join(args.cameras or args.tile)}: views are made by --render; add it.")
     if (base := base_data(args.data)) != args.data:
@@ -123,7 +136,13 @@ def render(cells: list[tuple[Path, Record]], args: Args) -> None:
     if len(args.tile) == 1:
         raise EpisodeError(f"--tile {args.tile[0]} is one view, expected at least two.")
     views = get_views(args.cameras, args.size)
-    with hold_lock(args.data):
+    with hold_lock(args.out or args.data):
+        if args.out:
+            asked = [folder for folder, record in cells if args.split in (None, seed_split(record.seed))]
+            if not asked:
+                raise EpisodeError(f"{args.data} has no accepted episode of the family {args.split}; choose another --split.")
+            render_changes(asked, args.change, args.out)
+            cells = list(read_dataset(args.out).accepted)
         render_videos([folder for folder, record in cells if not record.videos])
         render_views(cells, views)
         if args.tile:

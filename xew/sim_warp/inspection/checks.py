@@ -3,20 +3,25 @@
 from collections.abc import Callable, Sequence
 from functools import cache, partial
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from tqdm import tqdm
 
 from xew.concurrency import usable_cores
 from xew.dataset import Episode
-from xew.episode import EpisodeError, data_folder, verify_episode
-from xew.protocol import CameraSpec
+from xew.episode import EpisodeError, Record, data_folder, verify_episode
+from xew.protocol import RANDOM_CHANGE, CameraSpec
 from xew.sim_warp.cameras import demand_sight
+from xew.sim_warp.changes.scenes import check_change
 from xew.sim_warp.devices.workers import Workers, find_devices, worker_count
-from xew.sim_warp.production.rerender import add_tiled, add_videos, add_view, demand_plausible, render_again
+from xew.sim_warp.production.rerender import add_tiled, add_videos, add_view, demand_plausible, render_again, render_changed
 from xew.sim_warp.production.warm_up import compile_kernels
 from xew.sim_warp.rendering.render import Renderer
 from xew.sim_warp.robots import recorded_robot
+from xew.sim_warp.robots.user.own import KEPT, keep_robot, kept_robot
+
+Result = TypeVar("Result")
 
 EPISODES_PER_WORKER = 32
 """Number of episodes that justify one more process, by its start-up time."""
@@ -76,7 +81,7 @@ def tile_views(cells: Sequence[Episode], views: Sequence[str]) -> None:
     print(f"view {'+'.join(views)}: {sum(made)} of {len(cells)} episodes new")
 
 
-def _render_all(render: Callable[[Path], bool], folders: list[Path]) -> list[bool]:
+def _render_all(render: Callable[[Path], Result], folders: list[Path]) -> list[Result]:
     """Render episodes in worker processes if there are many, else here; returns the results in any order."""
     devices = find_devices(None)
     several = len(folders) >= 2 * EPISODES_PER_WORKER
@@ -87,10 +92,30 @@ def _render_all(render: Callable[[Path], bool], folders: list[Path]) -> list[boo
         return list(tqdm(results, desc="rendering", unit="episode", total=len(folders)))
 
 
+def render_changes(folders: list[Path], change: str, out: Path) -> None:
+    """Write episodes of one data set with a change to another, from their states. Raises EpisodeError if it needs physics."""
+    check_change(change)
+    if change.partition(":")[0] in ("height", RANDOM_CHANGE):
+        raise EpisodeError(f"the change {change} needs physics; run `python -m xew.sim_warp.generate --change {change}`.")
+    data = data_folder(folders[0])
+    for key in sorted({folder.name for folder in folders}):
+        if (data / KEPT / key).is_dir() and (robot := kept_robot(key, data)) is not None:
+            keep_robot(robot, out)
+    failed = [record for record in _render_all(partial(_render_change, change=change, out=out), folders) if not record.success]
+    print(f"{len(folders) - len(failed)} of {len(folders)} episodes rendered with the change {change} into {out}")
+    for record in failed:
+        print(f"{record.task} {record.seed} {record.robot}: {record.failure_detail}")
+
+
 @cache
 def _renderer() -> Renderer:
     """The renderer of this process on its own device, made once."""
     return Renderer()
+
+
+def _render_change(folder: Path, change: str, out: Path) -> Record:
+    """Write one episode with a change to another data set; returns its header."""
+    return render_changed(folder, change, out, _renderer())
 
 
 def _render_video(folder: Path) -> bool:

@@ -38,7 +38,7 @@ def light_view(camera: Camera) -> raster.View:
 def light_of(source: stage.Light) -> raster.Light:
     """A light of the stage, with the view of its shadow map."""
     light = raster.Light()
-    light.intensity = source.intensity
+    light.intensity = wp.vec3(*(source.intensity * np.array(source.color)))
     direction = np.array(source.direction) / np.linalg.norm(source.direction)
     light.to_light = wp.vec3(*-direction)
     if source.position is None:
@@ -54,10 +54,23 @@ def light_of(source: stage.Light) -> raster.Light:
     return light
 
 
-def stage_shading() -> shading.Shading:
+def pack_patterns(look: stage.Stage, device: wp.Device) -> shading.Patterns:
+    """The patterns of the stage's surfaces on a device."""
+    parts = stage.stage_parts(look)
+    shown = list({id(pattern): pattern for _, pattern in parts if pattern is not None}.values())
+    index = [-1 if pattern is None else shown.index(pattern) for _, pattern in parts]
+    images = stage.linear_from_srgb(np.array([pattern.image for pattern in shown])).astype(np.float32)
+    packed = shading.Patterns()
+    packed.image = wp.array(images if shown else np.zeros((0, 1, 1, 3), np.float32), dtype=wp.vec3, device=device)
+    packed.period = wp.array([pattern.period for pattern in shown], dtype=float, device=device)
+    packed.of_triangle = wp.array(np.repeat(index, [len(mesh.triangles) for mesh, _ in parts]), dtype=int, device=device)
+    return packed
+
+
+def stage_shading(ambient: float) -> shading.Shading:
     """Exposure, ambient light and gloss of the stage."""
     values = shading.Shading()
-    values.ambient = stage.AMBIENT
+    values.ambient = ambient
     values.sky_share = stage.SKY_SHARE
     values.exposure = stage.EXPOSURE
     values.specular = stage.SPECULAR

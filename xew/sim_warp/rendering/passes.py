@@ -9,7 +9,7 @@ from xew.sim_warp import stage
 from xew.sim_warp.geometry.camera import Camera
 from xew.sim_warp.rendering import raster_kernels as raster
 from xew.sim_warp.rendering import shading_kernels as shading
-from xew.sim_warp.rendering.lighting import SHADOW_SIZE, camera_views, light_of, stage_shading
+from xew.sim_warp.rendering.lighting import SHADOW_SIZE, camera_views, light_of, pack_patterns, stage_shading
 from xew.sim_warp.rendering.packing import Body, FrameTable, PackedGeometry, World, pack_frames, pack_geometry
 
 FLOW_LIMIT = 25.0
@@ -20,6 +20,16 @@ IDENTITY = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 
 @dataclass(frozen=True)
+class Look:
+    """Lights, shading and patterns of a stage as arguments of the kernels."""
+
+    lights: wp.array
+    """[l] raster.Light."""
+    patterns: shading.Patterns
+    shading: shading.Shading
+
+
+@dataclass(frozen=True)
 class Call:
     """Arguments of the renderer for all frames of a call."""
 
@@ -27,6 +37,7 @@ class Call:
     pose: wp.array
     """[P] wp.transform, poses of the bodies of all frames, world."""
     camera: Camera
+    look: Look
     shadows: int = 0
     """Number of lights with shadow maps."""
     wanted: frozenset[str] = frozenset()
@@ -73,10 +84,13 @@ class Passes:
     def __init__(self, device: wp.Device) -> None:
         self.device = device
         self._stripes = STRIPES["cuda" if device.is_cuda else "cpu"]
-        self._lights = wp.array([light_of(light) for light in stage.LIGHTS], dtype=raster.Light, device=device)
-        self._shading = stage_shading()
         ramp = stage.srgb_from_linear(np.linspace(0, 1, shading.COLORS))
         self._srgb = wp.array(ramp, dtype=wp.uint8, device=device)
+
+    def look(self, shown: stage.Stage) -> Look:
+        """The look of a stage on the device."""
+        lights = wp.array([light_of(light) for light in shown.lights], dtype=raster.Light, device=self.device)
+        return Look(lights, pack_patterns(shown, self.device), stage_shading(shown.ambient))
 
     def draw(self, call: Call, chunk: Chunk) -> Drawn:
         """Visibility of a chunk's frames and, if there are shadows, their shadow maps."""
@@ -91,7 +105,7 @@ class Passes:
         self._launch(
             raster.place_vertices,
             (count, chunk.vertex_count),
-            [call.geometry.arrays, chunk.world, chunk.pose, call.pose, chunk.cameras, self._lights],
+            [call.geometry.arrays, chunk.world, chunk.pose, call.pose, chunk.cameras, call.look.lights],
             [drawn.vertex, drawn.shadow_vertex],
         )
         self._launch(
@@ -117,7 +131,7 @@ class Passes:
         self._launch(
             shading.shade_pixels,
             (chunk.count, height, width),
-            [*posed, self._lights, self._shading, lit, self._srgb, *seen],
+            [*posed, call.look.lights, call.look.shading, lit, self._srgb, *seen],
             [rgb],
         )
         return rgb
@@ -149,18 +163,21 @@ class Passes:
         )
         return images
 
-    def light_stage(self, camera: Camera, ground: bool) -> shading.LitStage:
-        """The lit stage in the view of a camera, or in each view of one that moves; empty without a ground."""
-        bodies, views = [Body(stage.stage_mesh(), False)] if ground else [], len(camera.extrinsics) if camera.moves else 1
+    def light_stage(self, camera: Camera, shown: stage.Stage | None, look: Look) -> shading.LitStage:
+        """A stage with its look in the view of a camera, or in each view of one that moves; empty without a stage."""
+        bodies = [] if shown is None else [Body(stage.stage_mesh(shown), False)]
+        views = len(camera.extrinsics) if camera.moves else 1
         table, pose = pack_frames([World(bodies, np.tile(IDENTITY, (views, len(bodies), 1)))], [0])
         call = Call(
             geometry=pack_geometry([bodies], self.device),
             pose=wp.array(pose, dtype=wp.transform, device=self.device),
             camera=camera,
+            look=look,
         )
         chunk = Chunk(self.device, call.geometry, table, camera)
         drawn = self.draw(call, chunk)
-        height, width, lights = camera.height, camera.width, len(stage.LIGHTS) if ground else 0
+        height, width, lights = camera.height, camera.width, 0 if shown is None else len(shown.lights)
+        lighting = [look.lights, look.shading, drawn.vertex, drawn.key, wp.vec3(*stage.SKY), look.patterns]
         lit = shading.LitStage()
         lit.key = drawn.key
         lit.ambient = self._zeros((views, height, width), wp.vec3)
@@ -169,7 +186,7 @@ class Passes:
         self._launch(
             shading.light_stage,
             (views, height, width),
-            [call.geometry.arrays, chunk.cameras, self._lights, self._shading, drawn.vertex, drawn.key, wp.vec3(*stage.SKY)],
+            [call.geometry.arrays, chunk.cameras, *lighting],
             [lit.ambient, lit.direct, lit.shadow_texel],
         )
         return lit

@@ -55,7 +55,7 @@ class Light:
     view: View
     position: wp.vec3  # m, world
     to_light: wp.vec3  # unit vector, world
-    intensity: float  # of a near light at a distance of 1 m
+    intensity: wp.vec3  # linear RGB, of a near light at a distance of 1 m
 
 
 @wp.struct

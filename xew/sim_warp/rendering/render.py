@@ -12,7 +12,6 @@ import warp as wp
 
 from xew.concurrency import PARSING
 from xew.episode import HEIGHT, WIDTH
-from xew.sim_warp import stage
 from xew.sim_warp.devices.waiting import wait_for
 from xew.sim_warp.geometry.camera import HEAD_CAMERA, Camera, project
 from xew.sim_warp.rendering import shading_kernels as shading
@@ -26,7 +25,8 @@ from xew.sim_warp.rendering.packing import (
     pack_geometry,
     pack_points,
 )
-from xew.sim_warp.rendering.passes import FLOW_LIMIT, Call, Chunk, Passes
+from xew.sim_warp.rendering.passes import FLOW_LIMIT, Call, Chunk, Look, Passes
+from xew.sim_warp.stage import STANDARD, Stage
 
 __all__ = ["FLOW_LIMIT", "Body", "Frames", "Renderer", "World"]
 
@@ -35,7 +35,7 @@ FRAMES_PER_CHUNK = {"cpu": 4, "cuda": 512}
 MOVING_COST = 3
 """Memory of a frame of a camera that moves, relative to one that stands still: the lit stage is the frame's own."""
 STAGES_KEPT = 16
-"""Number of cameras with a cached lit stage, about 10 MB each."""
+"""Number of cameras and stages with a cached lit stage, about 10 MB each."""
 
 
 def _nothing() -> np.ndarray:
@@ -77,7 +77,8 @@ class Renderer:
         self._frames_per_chunk = frames_per_chunk or FRAMES_PER_CHUNK[kind]
         self._passes = Passes(self.device)
         self._pinned = wp.empty(0, dtype=wp.uint8, device="cpu")
-        self._stages: dict[tuple[bytes, int, int], shading.LitStage] = {}
+        self._looks: dict[Stage, Look] = {}
+        self._stages: dict[tuple[bytes, int, int, Stage | None], shading.LitStage] = {}
 
     def render(
         self,
@@ -101,6 +102,7 @@ class Renderer:
         camera: Camera = HEAD_CAMERA,
         ground: bool = True,
         *,
+        stage: Stage = STANDARD,
         depth: bool = False,
         body: bool = False,
         optical_flow: bool = False,
@@ -111,6 +113,7 @@ class Renderer:
         Args:
             camera: of all worlds; one that moves has a pose for each frame of all worlds, in order.
             ground: True for table, wall, ground and shadows; False for the bodies alone on white, without shadows.
+            stage: table, wall, ground and lights of all worlds; without the ground the light is the standard one.
             depth, body, optical_flow: requests for the optional images of `Frames`.
             colors: whether to make `rgb`.
 
@@ -123,9 +126,10 @@ class Renderer:
         optional = {"depth": depth, "body": body, "optical_flow": optical_flow}
         wanted = frozenset(name for name, asked_for in optional.items() if asked_for)
         with PARSING:  # threads share the device's buffers and modules
-            return _split_by_world(self._render_worlds(worlds, camera, ground, wanted, colors), worlds)
+            images = self._render_worlds(worlds, camera, stage if ground else None, wanted, colors)
+            return _split_by_world(images, worlds)
 
-    def probe_batch(self, worlds: Sequence[World], camera: Camera = HEAD_CAMERA) -> list[Frames]:
+    def probe_batch(self, worlds: Sequence[World], camera: Camera = HEAD_CAMERA, stage: Stage = STANDARD) -> list[Frames]:
         """As `render_batch` with stage, bodies and depth, but without `rgb`, for worlds with points.
 
         Raises:
@@ -138,20 +142,22 @@ class Renderer:
         if not worlds:
             return []
         with PARSING:
-            images = self._render_worlds(worlds, camera, True, frozenset({"body", "depth"}), colors=False)
+            images = self._render_worlds(worlds, camera, stage, frozenset({"body", "depth"}), colors=False)
             return _split_by_world(images, worlds)
 
     def _render_worlds(
-        self, worlds: Sequence[World], camera: Camera, ground: bool, wanted: frozenset[str], colors: bool = True
+        self, worlds: Sequence[World], camera: Camera, stage: Stage | None, wanted: frozenset[str], colors: bool = True
     ) -> dict[str, np.ndarray]:
         """Images of all frames of all worlds on the host, by the names of `Frames`; colors, with shadows, if asked for."""
         kinds, kind = distinct_worlds(worlds)
         table, pose = pack_frames(worlds, kind)
+        look = self._look(stage or STANDARD)
         call = Call(
             geometry=pack_geometry(kinds, self.device),
             pose=wp.array(pose, dtype=wp.transform, device=self.device),
             camera=camera,
-            shadows=len(stage.LIGHTS) if ground and colors else 0,
+            look=look,
+            shadows=len(stage.lights) if stage and colors else 0,
             wanted=wanted,
             colors=colors,
         )
@@ -160,7 +166,7 @@ class Renderer:
         host: dict[str, np.ndarray] = {}
         for chunk in (slice(i, i + count) for i in range(0, len(table.world), count)):
             at_chunk = replace(camera, extrinsics=camera.extrinsics[chunk]) if camera.moves else camera
-            lit = self._stage(at_chunk, ground)
+            lit = self._stage(at_chunk, stage, look)
             for name, image in self._render_chunk(call, table.select(chunk), lit, pixel[chunk]).items():
                 self._fetch(image, host, name, chunk, len(table.world))
         return host
@@ -195,18 +201,26 @@ class Renderer:
             images |= passes.probe(call, chunk, drawn, lit, pixel)
         return images
 
-    def _stage(self, camera: Camera, ground: bool) -> shading.LitStage:
-        """The lit stage of a camera, cached if it stands still; without a ground one entry serves all cameras of a size."""
-        if camera.moves and ground:
-            return self._passes.light_stage(camera, ground)
+    def _look(self, stage: Stage) -> Look:
+        """Lights, shading and patterns of a stage, cached."""
+        if stage not in self._looks:
+            if len(self._looks) >= STAGES_KEPT:
+                self._looks.clear()
+            self._looks[stage] = self._passes.look(stage)
+        return self._looks[stage]
+
+    def _stage(self, camera: Camera, stage: Stage | None, look: Look) -> shading.LitStage:
+        """The lit stage of a camera, cached if it stands still; without a stage one entry serves all cameras of a size."""
+        if camera.moves and stage:
+            return self._passes.light_stage(camera, stage, look)
         if camera.moves:
             camera = replace(camera, extrinsics=camera.extrinsics[0])
-        view = camera.intrinsics.tobytes() + camera.extrinsics.tobytes() if ground else b""
-        key = (view, camera.width, camera.height)
+        view = camera.intrinsics.tobytes() + camera.extrinsics.tobytes() if stage else b""
+        key = (view, camera.width, camera.height, stage)
         if key not in self._stages:
             if len(self._stages) >= STAGES_KEPT:
                 self._stages.clear()
-            self._stages[key] = self._passes.light_stage(camera, ground)
+            self._stages[key] = self._passes.light_stage(camera, stage, look)
         return self._stages[key]
 
 

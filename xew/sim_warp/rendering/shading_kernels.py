@@ -62,6 +62,15 @@ class LitStage:
     shadow_texel: wp.array4d(dtype=wp.vec3)  # [u l h w 3] float32 x y [texels] and nearness of the pixel's center
 
 
+@wp.struct
+class Patterns:
+    """Periodic images on surfaces of the stage."""
+
+    image: wp.array3d(dtype=wp.vec3)  # [x m m 3] float32 linear RGB
+    period: wp.array(dtype=float)  # [x] float32 m, side of each image on its surface
+    of_triangle: wp.array(dtype=int)  # [f] int32 index of a triangle's image, -1 for its plain color
+
+
 # ---- shadows
 
 
@@ -157,6 +166,39 @@ def surface_at(
 
 
 @wp.func
+def pattern_at(image: wp.array2d(dtype=wp.vec3), u: float, v: float) -> wp.vec3:
+    """The color of a periodic image at u to the right and v upward, in pixels, with bilinear weights."""
+    size = float(image.shape[0])
+    x = u - wp.floor(u / size) * size
+    y = v - wp.floor(v / size) * size
+    left = wp.min(int(x), image.shape[1] - 1)
+    low = wp.min(int(y), image.shape[0] - 1)
+    right = (left + 1) % image.shape[1]
+    high = (low + 1) % image.shape[0]
+    fx = x - float(left)
+    fy = y - float(low)
+    below = image[low, left] * (1.0 - fx) + image[low, right] * fx
+    above = image[high, left] * (1.0 - fx) + image[high, right] * fx
+    return below * (1.0 - fy) + above * fy
+
+
+@wp.func
+def stage_albedo(patterns: Patterns, triangle: int, surface: Surface) -> wp.vec3:
+    """The color of a point of the stage: linear RGB."""
+    pattern = patterns.of_triangle[triangle]
+    if pattern < 0:
+        return surface.albedo
+    image = patterns.image[pattern]
+    scale = float(image.shape[0]) / patterns.period[pattern]
+    point = surface.point * scale
+    if wp.abs(surface.normal[2]) > 0.5:
+        return pattern_at(image, point[0], point[1])
+    if wp.abs(surface.normal[1]) > 0.5:
+        return pattern_at(image, point[0], point[2])
+    return pattern_at(image, point[1], point[2])
+
+
+@wp.func
 def ambient_light(surface: Surface, shading: Shading) -> wp.vec3:
     """Light from everywhere, less of it on what faces down: linear RGB."""
     strength = shading.ambient * (1.0 - shading.sky_share * 0.5 * (1.0 - surface.normal[2]))
@@ -182,7 +224,7 @@ def direct_light(surface: Surface, light: Light, shading: Shading) -> wp.vec3:
     shine = shine * shine
     shine = shine * shine
     gloss = shading.specular * shine * shine
-    return (surface.albedo * facing + wp.vec3(gloss, gloss, gloss)) * (intensity * shading.exposure)
+    return wp.cw_mul(surface.albedo * facing + wp.vec3(gloss, gloss, gloss), intensity * shading.exposure)
 
 
 @wp.func
@@ -235,6 +277,7 @@ def light_stage(
     vertex_in: wp.array2d(dtype=wp.vec3),  # [u v 3] float32 m, camera's frame
     key_in: wp.array4d(dtype=wp.uint64),  # [u s h w] uint64, see `draw_triangles`
     sky: wp.vec3,  # linear RGB where nothing is
+    patterns: Patterns,
     # Out:
     ambient_out: wp.array3d(dtype=wp.vec3),  # [u h w 3] float32 linear RGB
     direct_out: wp.array4d(dtype=wp.vec3),  # [u l h w 3] float32 linear RGB, without shadows
@@ -253,6 +296,7 @@ def light_stage(
             ray = pixel_ray(camera, float(column) + OFFSET_X[sample], float(row) + OFFSET_Y[sample])
             seen = ray / nearness_of(key_in[u, sample, row, column])
             surface = surface_at(geometry, triangle, wp.transform_identity(), camera, seen, u, vertex_in)
+            surface.albedo = stage_albedo(patterns, triangle, surface)
             if sample != CENTER:
                 ambient += ambient_light(surface, shading) * 0.25
             for i in range(direct_out.shape[1]):
