@@ -134,12 +134,12 @@ def add_tiled(folder: Path, views: Sequence[str]) -> bool:
         raise EpisodeError(f"{folder}: the views {', '.join(views)} have the sizes {sorted(sizes)}; tile cameras of one size.")
     first, ((width, height),) = records[0], sizes
     root = path_below(data_folder(folder), VIEWS, "+".join(views))
-    if (episode_folder(root, first.task, first.seed, first.robot) / "episode.json").exists():
-        return False
+    camera = replace(first.camera, name="+".join(views), size=(width, height * len(views)))
     states = [read_states(part) for part in parts]
+    if _shows(episode_folder(root, first.task, first.seed, first.robot), camera, states[0]):
+        return False
     seen = replace(states[0], robot_mask=np.concatenate([of_part.robot_mask for of_part in states], axis=1))
     rgb, robot = (np.concatenate([read_pixels(part, name) for part in parts], axis=1) for name in ("rgb", "robot"))
-    camera = replace(first.camera, name="+".join(views), size=(width, height * len(views)))
     write_episode(root, replace(first, camera=camera), seen, rgb, robot)
     return True
 

@@ -126,7 +126,8 @@ class Renderer:
         optional = {"depth": depth, "body": body, "optical_flow": optical_flow}
         wanted = frozenset(name for name, asked_for in optional.items() if asked_for)
         with PARSING:  # threads share the device's buffers and modules
-            return _split_by_world(self._render_worlds(worlds, camera, stage if ground else None, wanted, colors), worlds)
+            images = self._render_worlds(worlds, camera, stage if ground else None, wanted, colors)
+            return _split_by_world(images, worlds)
 
     def probe_batch(self, worlds: Sequence[World], camera: Camera = HEAD_CAMERA, stage: Stage = STANDARD) -> list[Frames]:
         """As `render_batch` with stage, bodies and depth, but without `rgb`, for worlds with points.
