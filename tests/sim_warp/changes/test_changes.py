@@ -27,6 +27,7 @@ from xew.sim_warp.physics import Motion, World, simulate
 from xew.sim_warp.physics.gpu import simulate_batch
 from xew.sim_warp.production.cells import Job
 from xew.sim_warp.production.rerender import render_changed
+from xew.sim_warp.production.seeds import Family
 from xew.sim_warp.production.surfaces import read_surfaces
 from xew.sim_warp.production.warm_up import stand_at_home
 from xew.sim_warp.rendering.observe import Recording, observe, scene_recording
@@ -231,6 +232,8 @@ def test_random_changes_are_a_function_of_the_scene_and_never_graded() -> None:
     assert {change.strength for change in drawn if change} == {1, 2, 3}
     record = Record("lift_pot", 7, "piper", True, change=str(change_of("random", "lift_pot", 7)))
     demand_change(Path("here"), record, "random")
+    jobs = Family("lift_pot", 0, 3, NAMES, change="random").next_jobs()
+    assert [job.change for job in jobs] == [str(change) for change in drawn[:3]]
 
 
 @pytest.mark.parametrize("level", [1, 2, 3, 5])

@@ -4,7 +4,6 @@ A table of another height moves the objects and the plan's waypoints up or down;
 solved again. The clock stays the same.
 """
 
-import hashlib
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -24,8 +23,7 @@ HEIGHT_STEP = 0.01
 
 def change_rng(change: Change) -> np.random.Generator:
     """The random stream of a change, the same for its three strengths."""
-    key = int.from_bytes(hashlib.sha256(f"change {change.factor}".encode()).digest()[:8], "little")
-    return np.random.Generator(np.random.Philox(key=np.array([key, change.draw], np.uint64)))
+    return scene_rng(f"change {change.factor}", change.draw)
 
 
 def change_of(name: str, task: str, seed: int) -> str:
