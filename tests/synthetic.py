@@ -5,14 +5,15 @@ scene and the path of the hands depend on (task, seed) alone and only looks and 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from xew.episode import HEIGHT, WIDTH, Record, States, array_hash, write_episode
-from xew.protocol import ACTION_DIM, ARMS, ROBOT_NAMES
+from xew.dataset import VIEWS, find_accepted
+from xew.episode import HEIGHT, WIDTH, Record, States, array_hash, read_pixels, read_states, write_episode
+from xew.protocol import ACTION_DIM, ARMS, ROBOT_NAMES, CameraSpec
 
 FOCAL = 320.0
 INTRINSICS = np.array([[FOCAL, 0, (WIDTH - 1) / 2], [0, FOCAL, (HEIGHT - 1) / 2], [0, 0, 1]])
@@ -83,6 +84,24 @@ def write_cell(root: Path, task: str, seed: int, robot: str, frames: int) -> Pat
     return write_episode(
         root, record, states, np.where(mask[..., None], shading, empty), np.where(mask[..., None], shading, white)
     )
+
+
+def write_synthetic_view(root: Path, spec: CameraSpec) -> None:
+    """Add a view of every episode: the same pictures, mirrored, at the camera's size; one that moves has a pose a frame."""
+    width, height = spec.size
+
+    def resize(video: np.ndarray) -> np.ndarray:
+        return np.stack([cv2.resize(frame, (width, height), interpolation=cv2.INTER_AREA)[:, ::-1] for frame in video])
+
+    for folder, record in find_accepted(root):
+        states = read_states(folder)
+        moved = np.tile(states.extrinsics, (record.frame_count, 1, 1)) if spec.moves else states.extrinsics
+        mask = resize(states.robot_mask.astype(np.uint8)) > 0
+        seen = replace(
+            states, robot_mask=mask, extrinsics=moved, intrinsics=np.diag([width / WIDTH, height / HEIGHT, 1]) @ INTRINSICS
+        )
+        videos = [resize(read_pixels(folder, name)) for name in ("rgb", "robot")]
+        write_episode(root / VIEWS / spec.view, replace(record, camera=spec), seen, *videos)
 
 
 def sample_scene(task: str, seed: int, frames: int) -> Scene:

@@ -10,9 +10,10 @@ from collections.abc import Callable, Iterator
 from multiprocessing.connection import Connection
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from xew.concurrency import free_gpu_memory, leave_with_parent, map_in_order, map_in_processes
+from xew.concurrency import free_gpu_memory, leave_with_parent, map_in_order, map_in_processes, map_with_shared_memory
 from xew.episode import EpisodeError
 
 
@@ -217,3 +218,38 @@ def test_the_first_item_gets_what_the_opener_raises() -> None:
     with pytest.raises(FileNotFoundError, match="no weights"):
         list(map_in_processes(open_nothing, [1, 2, 3], 2))
     assert list(map_in_processes(open_nothing, [], 2)) == []
+
+
+def open_counter(folder: Path) -> Callable[[int], tuple[int, dict[str, np.ndarray]]]:
+    def count(number: int) -> tuple[int, dict[str, np.ndarray]]:
+        (folder / str(number)).touch()
+        return number, {"a": np.full((3, number), number, np.uint8), "b": np.arange(number, dtype=np.float32)}
+
+    return count
+
+
+def test_large_results_come_in_order_by_shared_memory(tmp_path: Path) -> None:
+    results = map_with_shared_memory(functools.partial(open_counter, tmp_path), range(9), 2)
+    for number, (found, arrays) in enumerate(results):
+        assert found == number and len(processes_of(tmp_path)) <= number + 6, "at most two items of each process begin ahead"
+        np.testing.assert_array_equal(arrays["a"], np.full((3, number), number, np.uint8))
+        assert arrays["b"].tolist() == list(range(number)) and arrays["b"].dtype == np.float32
+    assert number == 8
+
+
+def shared_memories() -> list[str]:
+    paths = (os.path.realpath(f"/proc/self/fd/{name}") for name in os.listdir("/proc/self/fd"))
+    return [path for path in paths if "memfd:result" in path]
+
+
+def test_no_memory_is_left_behind_who_takes_no_more_results(tmp_path: Path) -> None:
+    results = map_with_shared_memory(functools.partial(open_counter, tmp_path), range(1, 9), 2)
+    next(results)
+    assert len(shared_memories()) >= 2
+    results.close()
+    assert not shared_memories()
+
+
+def test_small_results_need_no_shared_memory() -> None:
+    found = map_with_shared_memory(open_reader, ["HOME", "PATH"], 1)
+    assert [text for text, _ in found] == [os.environ["HOME"], os.environ["PATH"]]

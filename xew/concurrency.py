@@ -1,8 +1,12 @@
 """Threads and processes: work done ahead and in order, and worker processes that end with their parent."""
 
 import functools
+import itertools
+import math
+import mmap
 import multiprocessing
 import os
+import pickle
 import signal
 import subprocess
 import threading
@@ -10,15 +14,19 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from itertools import cycle, islice
+from multiprocessing import forkserver
 from multiprocessing.queues import SimpleQueue
-from typing import Any, TypeVar
+from multiprocessing.synchronize import Event as ProcessEvent
+from operator import length_hint
+from typing import Any, BinaryIO, TypeVar
 
 from xew.names import EpisodeError
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
+Event = threading.Event | ProcessEvent
+"""Event that is set for running calls to end early."""
 KILLED = "a worker process was killed, perhaps for lack of memory. Completed work is stored: run the command again"
 """Message for a worker that the system has killed."""
 PARSING = threading.RLock()
@@ -58,7 +66,7 @@ def map_in_order(
     function: Callable[[Item], Result],
     items: Iterable[Item],
     workers: int | None = None,
-    stop: threading.Event | None = None,
+    stop: Event | None = None,
 ) -> Iterator[Result]:
     """Results of a function over items, in their order, computed by threads that are at most a few items ahead.
 
@@ -69,18 +77,29 @@ def map_in_order(
     """
     workers = workers or usable_cores()
     with ThreadPoolExecutor(workers) as pool:
-        waiting: deque[Future[Result]] = deque()
         try:
-            for item in items:
-                waiting.append(pool.submit(function, item))
-                if len(waiting) > 2 * workers:
-                    yield waiting.popleft().result()
-            while waiting:
-                yield waiting.popleft().result()
+            yield from _take_in_order((pool.submit(function, item) for item in items), 2 * workers)
         finally:
             pool.shutdown(wait=False, cancel_futures=True)
             if stop is not None:
                 stop.set()
+
+
+def _take_in_order(calls: Iterable[Future[Result]], ahead: float) -> Iterator[Result]:
+    """Results of calls in their order; at most `ahead` calls begin before the first result is taken."""
+    waiting: deque[Future[Result]] = deque()
+    for call in calls:
+        waiting.append(call)
+        if len(waiting) > ahead:
+            yield waiting.popleft().result()
+    while waiting:
+        yield waiting.popleft().result()
+
+
+def prepare_processes(imported: Sequence[str]) -> None:
+    """Start the process that worker processes are forked from, unless it runs; it imports their modules meanwhile."""
+    multiprocessing.set_forkserver_preload(list(imported))
+    forkserver.ensure_running()
 
 
 def open_processes(
@@ -102,10 +121,10 @@ def open_processes(
         begin: called with `arguments` in each process before its first task.
         own: resources that processes get in turn, such as GPUs; the last argument of `begin`.
     """
-    multiprocessing.set_forkserver_preload(list(imported))
+    prepare_processes(imported)
     context = multiprocessing.get_context("forkserver")
     turns = context.SimpleQueue()
-    for item in islice(cycle(own), max(1, count)):
+    for item in itertools.islice(itertools.cycle(own), max(1, count)):
         turns.put(item)
     return ProcessPoolExecutor(
         max(1, count), context, _begin_process, (dict(os.environ), begin, arguments, turns if own else None)
@@ -123,10 +142,11 @@ def _begin_process(
 
 def map_in_processes(
     opener: Callable[[], Callable[[Item], Result]],
-    items: Sequence[Item],
+    items: Iterable[Item],
     processes: int,
     imported: Sequence[str] = (),
     gpus: Sequence[str] = (),
+    ahead: float = math.inf,
 ) -> Iterator[Result]:
     """Results of a function over items, in their order, computed by worker processes that exit after the last result.
 
@@ -136,20 +156,65 @@ def map_in_processes(
         processes: largest number of processes.
         imported: modules that the processes need; see `open_processes`.
         gpus: GPUs as CUDA_VISIBLE_DEVICES names them, one for each process in turn; default: every process sees all.
+        ahead: largest number of items that begin before the consumer takes the first result.
 
     Raises:
         EpisodeError: a process was killed.
     """
-    count = min(processes, len(items))
+    count = min(processes, length_hint(items, processes))
     pool = open_processes(count, imported, _open_function, (opener,), gpus)
     try:
         for _ in range(count):
             pool.submit(_open_early)
-        yield from pool.map(_call_function, items)
+        yield from _take_in_order((pool.submit(_call_function, item) for item in items), ahead)
     except BrokenProcessPool as error:
         raise EpisodeError(f"{KILLED}, and end other programs or use fewer processes if it happens again.") from error
     finally:
         pool.shutdown(cancel_futures=True)
+
+
+def map_with_shared_memory(
+    opener: Callable[[], Callable[[Item], Result]], items: Sequence[Item], processes: int, imported: Sequence[str] = ()
+) -> Iterator[Result]:
+    """`map_in_processes` for results that hold large arrays: these are written to shared memory, not to a pipe.
+
+    At most two items of each process begin ahead. The memory has no name, so none is left behind when processes are killed.
+    It needs Linux.
+    """
+    memories: deque[BinaryIO] = deque()
+
+    def add_memory() -> Iterator[tuple[str, Item]]:
+        for item in items:
+            memories.append(os.fdopen(os.memfd_create("result"), "r+b"))
+            yield f"/proc/{os.getpid()}/fd/{memories[-1].fileno()}", item
+
+    count = min(processes, len(items))
+    try:
+        for content, sizes in map_in_processes(
+            functools.partial(_open_sharing, opener), add_memory(), count, imported, ahead=2 * count
+        ):
+            with memories.popleft() as memory:
+                shared = memoryview(mmap.mmap(memory.fileno(), 0) if any(sizes) else b"")
+            places = itertools.pairwise(itertools.accumulate(sizes, initial=0))
+            yield pickle.loads(content, buffers=[shared[start:end] for start, end in places])
+    finally:
+        for memory in memories:
+            memory.close()
+
+
+def _open_sharing(opener: Callable[[], Callable[[Item], Any]]) -> Callable[[tuple[str, Item]], tuple[bytes, list[int]]]:
+    function = opener()
+
+    def call(place: tuple[str, Item]) -> tuple[bytes, list[int]]:
+        path, item = place
+        buffers: list[pickle.PickleBuffer] = []
+        content = pickle.dumps(function(item), protocol=5, buffer_callback=buffers.append)
+        arrays = [buffer.raw() for buffer in buffers]
+        with open(path, "r+b") as memory:
+            memory.writelines(arrays)
+        return content, [array.nbytes for array in arrays]
+
+    return call
 
 
 _opened: list[Callable[[], Any]] = []

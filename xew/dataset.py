@@ -12,14 +12,17 @@ from fractions import Fraction
 from functools import cached_property
 from pathlib import Path
 
-from xew.episode import TEMPORARY, EpisodeError, Record, exact_rate, read_record
-from xew.protocol import MOTIONS, seed_split
+from xew.episode import TEMPORARY, EpisodeError, Record, data_folder, exact_rate, read_record
+from xew.names import check_name, folder_name
+from xew.protocol import HEAD, MOTIONS, RANDOM_CHANGE, seed_split
 
 Episode = tuple[Path, Record]
 """Folder and header of one cell."""
 Signature = tuple[int, int, int, int]
 """Inode, size, time of change and of status change [ns] of a header's file."""
 
+VIEWS = "views"
+"""Folder of the views besides `head` in a data set."""
 UNSETTLED_NS = 100_000_000
 """Age [ns] below which a header is read again next time: two writes within one clock tick have equal time stamps."""
 
@@ -147,6 +150,18 @@ def demand_one_motion(data: Path, records: Iterable[Record]) -> str:
     return next(iter(counts), MOTIONS[0])
 
 
+def demand_one_change(data: Path, records: Iterable[Record]) -> str:
+    """The change of a data set's episodes: empty, one, or RANDOM_CHANGE. Raises EpisodeError if only some have a change."""
+    counts = Counter(record.change for record in records)
+    if len(counts) > 1 and "" in counts:
+        changed = ", ".join(sorted(change for change in counts if change)[:3])
+        raise EpisodeError(
+            f"{data} has {counts['']} unchanged episodes and {counts.total() - counts['']} with a change ({changed}), which "
+            "cannot be compared; keep them in separate data sets."
+        )
+    return RANDOM_CHANGE if len(counts) > 1 else next(iter(counts), "")
+
+
 def demand_one_rate(data: Path, records: Iterable[Record]) -> Fraction:
     """The frame rate [Hz] of episodes, of which there is at least one. Raises EpisodeError if they have several."""
     counts = Counter(exact_rate(record.frame_rate) for record in records)
@@ -167,6 +182,51 @@ def count_motions(records: Iterable[Record]) -> dict[str, int]:
 
 def _list_motions(counts: dict[str, int]) -> str:
     return "episodes " + " and ".join(f"of {motion} motion ({count})" for motion, count in counts.items())
+
+
+def view_folder(data: Path, view: str) -> Path:
+    """The root of a view's data set: of `head` the data set itself.
+
+    Raises:
+        EpisodeError: the data set has no such view.
+    """
+    if view == HEAD:
+        return Path(data)
+    folder = Path(data) / VIEWS / folder_name(check_name(view, "view"))
+    if not folder.is_dir():
+        known = ", ".join([HEAD, *list_views(data)])
+        raise EpisodeError(
+            f"{data} has no view {view!r}, but {known}; add it by `python -m xew.sim_warp.inspect {data} --render --cameras "
+            "NAME [--size 640x480]`."
+        )
+    return folder
+
+
+def view_episode(folder: Path, view: str) -> Path:
+    """The folder of an episode, of any view, in a view of its data set. Raises EpisodeError if the view does not have it."""
+    seen = view_folder(base_data(data_folder(folder)), view).joinpath(*folder.absolute().parts[-3:])
+    if not seen.is_dir():
+        raise EpisodeError(f"the view {view} has no episode {seen}; run `inspect DATA --render --cameras …` again to add it.")
+    return seen
+
+
+def list_views(data: Path) -> list[str]:
+    """Names of a data set's views besides `head`, sorted."""
+    return sorted(folder.name for folder in Path(data, VIEWS).glob("[!.]*") if folder.is_dir())
+
+
+def base_data(data: Path) -> Path:
+    """The data set that a view's data set lies in; another data set is its own."""
+    root = Path(data).absolute()
+    is_view = root.parent.name == VIEWS and next(root.parents[1].glob("*/*/*/episode.json"), None) is not None
+    return root.parents[1] if is_view else Path(data)
+
+
+def folder_beside(data: Path, name: str) -> Path:
+    """The folder for what is made of a data set, `<data>-NAME`; of a view, below that of the data set."""
+    base, data = base_data(data), Path(data)
+    folder = base.with_name(f"{base.name}-{name}")
+    return folder if base == data else folder / VIEWS / data.name
 
 
 def explain_missing(data: Path, what: str = "episode") -> EpisodeError:

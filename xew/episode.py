@@ -7,6 +7,9 @@ An episode is a folder `<data>/<task>/<seed>/<robot>/`:
     robot.mkv      the robot alone, posed by the commanded joints, on a white ground, lossless
 Folders appear under their final name only when complete. A rejected cell has only its episode.json.
 
+Another camera's view of the data is a data set of the same form below it, `<data>/views/<view>/<task>/<seed>/<robot>/`
+(`xew.dataset.view_folder`). Its states are the episode's, with that camera's keypoints, mask and matrices.
+
 Shape letters, here and everywhere: t frames, h w c image, j joints, a action, o objects, k keypoints, n worlds, b batch.
 Quaternions are x y z w; the world frame has its origin under the table's center, x right, y away from the robot, z up.
 """
@@ -35,10 +38,10 @@ from xew.config import ConfigError, parse
 from xew.files import LoadedFile, check_place, file_digest, load_file, read_json, sweep
 from xew.names import EpisodeError as EpisodeError
 from xew.names import check_label, check_name, folder_name, name_of_folder, path_below
-from xew.protocol import FRAME_RATE, MOTIONS, SHARED_MOTION
+from xew.protocol import CAMERA_SIZE, FRAME_RATE, HEAD_SPEC, MOTIONS, SHARED_MOTION, CameraSpec, parse_change
 
 SCHEMA_VERSION = 2
-WIDTH, HEIGHT = 320, 240
+WIDTH, HEIGHT = CAMERA_SIZE
 FAILURES = ("plan", "grasp", "slip", "timeout", "physics", "overflow")
 """plan: no joint path. grasp: never held. slip: held and lost. timeout: the plan ended without success.
 physics: an object sank into something, fell off the table or slid in a hand. overflow: a physics buffer was too small."""
@@ -76,6 +79,10 @@ FORMS = {
     "extrinsics": "float64 4 4",
 }
 """Type and shape of each array of `States`."""
+MOVING_FORMS = FORMS | {"extrinsics": "float64 t 4 4"}
+"""The same of a camera that moves."""
+NEW_FIELDS = ("camera",)
+"""Fields of a header that are written only if they are not their default: headers without them keep their bytes."""
 
 
 @dataclass(frozen=True)
@@ -104,11 +111,11 @@ class States:
     keypoint_visible: np.ndarray
     """[t k] bool, in the image and not hidden by an object or by another link."""
     robot_mask: np.ndarray
-    """[t h w] bool, pixels in which the head camera sees the robot."""
+    """[t h w] bool, pixels in which the camera sees the robot."""
     intrinsics: np.ndarray
-    """[3 3] float64, the head camera's K [pixels]."""
+    """[3 3] float64, the camera's K [pixels]."""
     extrinsics: np.ndarray
-    """[4 4] float64, world to camera (x right, y down, z forward)."""
+    """[4 4] float64, world to camera (x right, y down, z forward), or [t 4 4] of a camera that moves with the robot."""
 
     @property
     def frame_count(self) -> int:
@@ -147,8 +154,12 @@ class Record:
     """Whether rgb and robot are stored. If not, `python -m xew.sim_warp.inspect --render` renders them."""
     motion: str = SHARED_MOTION
     """Kind of motion, one of `xew.protocol.MOTIONS`."""
+    change: str = ""
+    """The scene's one change as `FACTOR:LEVEL` (`xew.protocol.parse_change`); empty for an unchanged scene."""
     files: dict[str, str] = field(default_factory=dict)
     """SHA-256 of the files as they were written, by name. The decoded bytes of such a file need not be compared."""
+    camera: CameraSpec = HEAD_SPEC
+    """The camera, with the place that it has on this robot."""
 
 
 def episode_folder(data: Path, task: str, seed: int, robot: str) -> Path:
@@ -223,12 +234,19 @@ def write_episode(
                     if videos:
                         write_video(temporary / f"{name}.mkv", video, record.frame_rate)
             written = {path.name: file_digest(path) for path in sorted(temporary.iterdir())}
-            header = asdict(record) | {"hashes": hashes, "files": written, "videos": videos}
+            header = _plain_header(replace(record, hashes=hashes, files=written, videos=videos))
             (temporary / "episode.json").write_text(json.dumps(header, indent=1) + "\n", encoding="utf-8")
     except OSError as error:
         reason = error.strerror or error  # without the temporary name
         raise EpisodeError(f"cannot write the episode {folder}: {reason}. Free some space or choose another --out.") from error
     return folder
+
+
+def _plain_header(record: Record) -> dict[str, Any]:
+    """The content of episode.json."""
+    defaults = {f.name: f.default for f in fields(Record) if f.name in NEW_FIELDS}
+    unchanged = {name for name, value in defaults.items() if getattr(record, name) == value}
+    return {name: value for name, value in asdict(record).items() if name not in unchanged}
 
 
 @contextmanager
@@ -306,10 +324,15 @@ def _check_record(record: Record) -> Record:
         _folder_names(record.task, record.seed, record.robot)
         for name in (*record.object_names, *record.keypoint_names):
             check_label(name, "name of an object or keypoint")
+        check_name(record.camera.name, "name of a camera")
     except EpisodeError as error:
         raise ValueError(str(error).rstrip(".")) from error
+    if record.camera.problem:
+        raise ValueError(record.camera.problem)
     if record.motion not in MOTIONS:
         raise ValueError(f"its motion is {record.motion!r}, expected {' or '.join(MOTIONS)}")
+    if record.change != (change := str(parse_change(record.change) or "")):
+        raise ValueError(f"its change is {record.change!r}, expected {change!r}")
     if not SLOWEST <= record.frame_rate <= FASTEST or record.frame_count < 0:
         raise ValueError(f"it has {record.frame_count} frames at {record.frame_rate} a second")
     return record
@@ -340,7 +363,7 @@ def read_states(folder: Path, record: Record | None = None) -> States:
         file = load_file(path)
         record = record or read_record(folder)
         arrays = read_npz(file)
-        arrays["robot_mask"] = np.unpackbits(arrays["robot_mask"], axis=-1).astype(bool)
+        arrays["robot_mask"] = np.unpackbits(arrays["robot_mask"], axis=-1).view(bool)
         states = States(**arrays)
         _check_states(states, record)
     except FileNotFoundError as error:
@@ -356,7 +379,7 @@ def read_states(folder: Path, record: Record | None = None) -> States:
 
 def _check_states(states: States, record: Record) -> None:
     """Raise ValueError unless the arrays have their types, shapes and, where they are known, finite numbers."""
-    sizes = check_forms(vars(states), FORMS)
+    sizes = check_forms(vars(states), MOVING_FORMS if record.camera.moves else FORMS)
     counts = {"t": record.frame_count, "o": len(record.object_names), "k": len(record.keypoint_names)}
     for letter, what in (("t", "frames"), ("o", "objects"), ("k", "keypoints")):
         if sizes[letter] != counts[letter]:
@@ -411,20 +434,21 @@ def _compare(file: LoadedFile, name: str, record: Record, found: str) -> None:
 
 
 def project(points: np.ndarray, intrinsics: np.ndarray, extrinsics: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Project world points by the pinhole camera of all episodes, without distortion or skew.
+    """Project world points by a pinhole camera without distortion or skew.
 
     Pixels: x right, y down, (0, 0) is the center of the upper left pixel. Camera frame: x right, y down, z forward.
 
     Args:
-        points: [... 3] m, world frame.
+        points: [... 3] m, world frame; [t n 3] for a camera that moves.
         intrinsics: [3 3] K [pixels].
-        extrinsics: [4 4] world to camera [m].
+        extrinsics: [4 4] world to camera [m], or [t 4 4] of a camera that moves.
 
     Returns:
         Pixels [... 2] and depths along the optical axis [...] m, both float64 if an argument is. Pixels of points at or behind
         the camera (depth <= 0) are NaN.
     """
-    in_camera = points @ extrinsics[:3, :3].T + extrinsics[:3, 3]
+    offset = extrinsics[:3, 3] if extrinsics.ndim == 2 else extrinsics[:, None, :3, 3]
+    in_camera = points @ extrinsics[..., :3, :3].swapaxes(-1, -2) + offset
     depth = in_camera[..., 2]
     focal = intrinsics[[0, 1], [0, 1]]
     front = np.where(depth > 0, depth, np.nan)

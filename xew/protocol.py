@@ -1,8 +1,9 @@
-"""The protocol of a study as plain data: roles of robots, splits, seeds, variants, counts, and the layout of a command.
+"""The protocol of a study as plain data: roles of robots, splits, seeds, counts, commands and cameras.
 
 It follows the paper's section 3 and its appendix. Every package may import this file, which imports nothing of xew.
 """
 
+import math
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -32,10 +33,82 @@ DIMENSION_TITLES = {
 }
 """Titles of the dimensions, the groups of metrics, which are never combined into one number."""
 
+CAMERA_SIZE = (320, 240)
+"""Width and height of the head camera's picture [pixels]."""
+LARGEST_SIDE = 4096
+"""Largest width and height of a camera's picture [pixels]."""
+HEAD = "head"
+"""Name of the camera, and of its view, that every data set has."""
+
+
+@dataclass(frozen=True)
+class CameraSpec:
+    """A camera as data: what it is fixed to, where it looks, and its picture. The default is the head camera."""
+
+    name: str = HEAD
+    fixed_to: str = "world"
+    """world, left_tool or right_tool (the tool's frame, x out of the hand), or a link of the robot, such as left/link6."""
+    position: tuple[float, float, float] = (-0.032, -0.45, 1.35)
+    """Center of projection [m], in the frame of what it is fixed to."""
+    target: tuple[float, float, float] = (-0.032, 0.15, 0.55)
+    """Point in the middle of the picture [m], in the same frame."""
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    """Direction that points up in the picture, in the same frame."""
+    vertical_fov: float = 37.0
+    """Full vertical angle of view [deg]."""
+    size: tuple[int, int] = CAMERA_SIZE
+    """Width and height of the picture [pixels]."""
+
+    @property
+    def view(self) -> str:
+        """Name of the camera's view in a data set: the camera's name, with the size if that is not 320x240."""
+        width, height = self.size
+        return self.name if self.parts or self.size == CAMERA_SIZE else f"{self.name}_{width}x{height}"
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """The views that this one tiles into one picture, from top to bottom, named head+wrist_left; usually none."""
+        return tuple(self.name.split("+")) if "+" in self.name else ()
+
+    @property
+    def moves(self) -> bool:
+        """Whether the camera moves with the robot."""
+        return self.fixed_to != "world"
+
+    @property
+    def problem(self) -> str:
+        """Reason why the numbers make no picture; empty if they do."""
+        line = [to - start for start, to in zip(self.position, self.target, strict=True)]
+        (a, b, c), (x, y, z) = line, self.up
+        sideways = math.hypot(b * z - c * y, c * x - a * z, a * y - b * x)
+        if not all(map(math.isfinite, (sideways, self.vertical_fov))) or not 1 <= self.vertical_fov <= 170:
+            return f"the camera has a field of view of {self.vertical_fov:g} degrees; expected 1 to 170, and finite numbers"
+        if sideways < 1e-6:
+            return (
+                f"the camera at {self.position} looks at {self.target} with {self.up} upward; choose a target away from its "
+                "position, and an up across the line of sight"
+            )
+        if not 1 <= min(self.size) <= max(self.size) <= LARGEST_SIDE:
+            return f"the camera has a picture of {self.size} pixels, expected sides of 1 to {LARGEST_SIDE}"
+        return ""
+
+
+HEAD_SPEC = CameraSpec()
+
 SHARED_MOTION, OWN_MOTION = "shared", "own"
 MOTIONS = (SHARED_MOTION, OWN_MOTION)
 """Kinds of motion. Shared: all robots of a scene follow one tool path on one clock; only the body differs. Own: each robot
 moves between the task's waypoints on its own path, in its own time and from its own rest posture."""
+
+FACTORS = ("light", "background", "table", "clutter", "height", "camera")
+"""Factors of a scene, of which a change concerns one; everything else stays the same."""
+STRENGTHS = 3
+"""Number of strengths of a change, each stronger than the previous one."""
+MOST_LEVEL = 99
+"""Largest level of a change. Levels 1 to 3 grow in strength and are for grading. Each further three are another draw of these
+strengths. `RANDOM_CHANGE` draws from level 4 on, so training never shows a graded level."""
+RANDOM_CHANGE = "random"
+"""Name of the change that is drawn for each scene, as a function of task and seed."""
 
 FRAME_RATE = 1000 / 60
 """Number of stored frames per second [Hz]: one every 15 physics steps of 4 ms."""
@@ -127,9 +200,50 @@ def validation_split(split: Split) -> Split:
     return replace(split, held_out_robots=VALIDATION_BODIES)
 
 
-def split_key(split: str, motion: str) -> str:
-    """The key of a split in a kind of motion: fixed, fixed_own."""
-    return split if motion == SHARED_MOTION else f"{split}_{motion}"
+@dataclass(frozen=True)
+class Change:
+    """One factor of a scene at a level; level 0 leaves the scene unchanged."""
+
+    factor: str
+    level: int
+
+    @property
+    def strength(self) -> int:
+        """1, 2 or 3."""
+        return (self.level - 1) % STRENGTHS + 1
+
+    @property
+    def draw(self) -> int:
+        """The number of the draw that determines direction, color or pattern, the same for three strengths."""
+        return (self.level - 1) // STRENGTHS
+
+    def __str__(self) -> str:
+        return f"{self.factor}:{self.level}"
+
+
+SHIFTS = tuple(str(Change(factor, level)) for factor in FACTORS for level in range(1, STRENGTHS + 1))
+"""Changes of the protocol of shifts: each factor at the three graded levels."""
+
+
+def parse_change(text: str) -> Change | None:
+    """The change that a text such as `light:2` names; None for no change: an empty text or level 0.
+
+    Raises:
+        ValueError: it names no factor, or a level out of range.
+    """
+    if not text:
+        return None
+    factor, _, level = text.partition(":")
+    if factor not in FACTORS or not re.fullmatch("[0-9]{1,9}", level) or int(level) > MOST_LEVEL:
+        factors = f"{', '.join(FACTORS[:-1])} or {FACTORS[-1]}"
+        raise ValueError(f"{text!r} is no change, expected {factors} with a level from 0 to {MOST_LEVEL}, such as light:2")
+    return Change(factor, int(level)) if int(level) else None
+
+
+def split_key(split: str, motion: str, change: str = "") -> str:
+    """The key of a split or data set in a kind of motion, with a change: fixed, fixed_own, data_light_2."""
+    own, changed = motion if motion != SHARED_MOTION else "", change.replace(":", "_")
+    return "_".join(part for part in (split, own, changed) if part)
 
 
 _SHARED_SPLITS = (
@@ -250,6 +364,8 @@ PARTS: dict[str, tuple[Variant, ...]] = {
     "bodies": (reference("scaling_seen", embodiment="robot_render"),),
     # With the conditions of the LOEO folds.
     "halves": tuple(reference(split, *MULTI_VIEW) for split in HALVES),
+    # The recommended model, graded on changed scenes (`Study.changes`) as well.
+    "shifts": (reference(action="mask_and_flow_channels", embodiment="pasted_render"),),
 }
 """Variants that each table compares, in the order of its rows. A variant may be in several parts."""
 PAPER_PARTS = ("fixed", "actions", "ladder", "loeo", "few_shot", "forgetting", "baselines")

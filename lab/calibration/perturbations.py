@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from xew.episode import States, data_folder, demand_known, read_record, read_states
-from xew.protocol import ARMS
+from xew.protocol import ARMS, parse_change
 
 
 @dataclass(frozen=True)
@@ -90,21 +90,23 @@ def render_perturbations(folder: Path) -> Iterator[tuple[str, Perturbation]]:
 
 def render_perturbation(folder: Path, states: States) -> Perturbation:
     """The scene of an episode with its robot and objects where other states have them."""
+    from xew.sim_warp.changes.looks import stage_of
+    from xew.sim_warp.changes.scenes import make_scene
     from xew.sim_warp.devices.workers import quiet_warp
-    from xew.sim_warp.geometry.camera import HEAD_CAMERA, project
+    from xew.sim_warp.geometry.camera import project, spec_camera
     from xew.sim_warp.rendering.observe import observe, scene_recording
     from xew.sim_warp.rendering.streams import default_renderer
     from xew.sim_warp.robots import recorded_robot
-    from xew.sim_warp.scene import scene_rng
     from xew.sim_warp.tasks import recorded_task
 
     quiet_warp()
     record = read_record(folder)
-    scene = recorded_task(record.task).sample(scene_rng(record.task, record.seed), record.seed)
+    scene = make_scene(recorded_task(record.task), record.task, record.seed, record.change)
     robot = recorded_robot(record.robot, data_folder(folder))
     seen = scene_recording(robot, scene, states.joint_pos, states.object_pose, states.object_joint)
-    view = observe(default_renderer(), [seen])[0]
-    objects, _ = project(HEAD_CAMERA, states.object_pose[..., :3].astype(np.float64))
+    camera = spec_camera(record.camera)
+    view = observe(default_renderer(), [seen], camera, stage_of(parse_change(record.change)))[0]
+    objects, _ = project(camera, states.object_pose[..., :3].astype(np.float64))
     return Perturbation(view.rgb, view.robot_mask, view.keypoints, objects.astype(np.float32))
 
 

@@ -277,8 +277,9 @@ def test_missing_inputs_name_the_command_that_makes_them(study: Study, tmp_path:
         (Args(study.scores, tmp_path / "void"), "xew.sim_warp.generate"),
         (Args(study.scores, study.data, (tmp_path / "void",)), "xew.model.rollout"),
         (Args(study.scores, held_out=("panda",)), "franka_panda"),
-        (Args(study.scores, distances=tmp_path), "--distances and --other-motion are for the report of a study"),
-        (Args(study.scores, other_motion=study.scores), "--distances and --other-motion are for the report of a study"),
+        (Args(study.scores, distances=tmp_path), "--other-motion and --shifted are for the report of a study"),
+        (Args(study.scores, other_motion=study.scores), "--other-motion and --shifted are for the report of a study"),
+        (Args(study.scores, shifted=(study.scores,)), "--other-motion and --shifted are for the report of a study"),
         (Args(distances=tmp_path, paper=True), "leave out scores"),
     ):
         with pytest.raises(SystemExit):

@@ -94,6 +94,34 @@ def write_legacy(path: Path, size: tuple[int, int] = (WIDTH, HEIGHT)) -> Path:
     return path
 
 
+def wrist_extrinsics(arm: int) -> np.ndarray:
+    """[t 4 4] world to a camera 0.1 m behind the tool center point that looks along the hand."""
+    to_tool = np.linalg.inv(matrix_from_pose(tool_poses()[:, arm]))
+    return np.array([[0, 1, 0, 0], [0, 0, 1, 0], [1, 0, 0, 0.1], [0, 0, 0, 1.0]]) @ to_tool
+
+
+def add_cameras(path: Path) -> Path:
+    """Add the wrist cameras and a camera in front to a file, by the names and readings of its layout."""
+    side = HEAD_CAMERA.extrinsics @ np.array([[1, 0, 0, 0.1], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    poses = [wrist_extrinsics(0), wrist_extrinsics(1), np.tile(side, (FRAMES, 1, 1))]
+    with h5py.File(path, "a") as file:
+        legacy = "observation" in file
+        names = (
+            ("left_camera", "right_camera", "front_camera")
+            if legacy
+            else ("cam_left_wrist", "cam_right_wrist", "cam_third_view")
+        )
+        for name, matrices in zip(names, poses, strict=True):
+            group = f"{'observation' if legacy else 'vision'}/{name}"
+            file[f"{group}/{'rgb' if legacy else 'colors'}"] = np.array([encoded(picture(), not legacy)] * FRAMES)
+            file[f"{group}/{'intrinsic_cv' if legacy else 'intrinsic_matrix'}"] = intrinsics()
+            if legacy:
+                file[f"{group}/extrinsic_cv"] = matrices[:, :3]
+            else:
+                file[f"{group}/extrinsics_matrix"] = np.linalg.inv(matrices)
+    return path
+
+
 def write_modern(path: Path, marked: bool = True) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     with h5py.File(path, "w") as file:

@@ -11,12 +11,12 @@ import pandas as pd
 import pyarrow.parquet as parquet
 import pytest
 
-from tests.synthetic import write_synthetic_data
-from xew.dataset import find_accepted
+from tests.synthetic import write_synthetic_data, write_synthetic_view
+from xew.dataset import find_accepted, view_episode
 from xew.episode import HEIGHT, WIDTH, EpisodeError, Record, States, read_states, read_video, write_episode
 from xew.exchange import lerobot
 from xew.exchange.lerobot import Args, _color_statistics, color_counts, export, main
-from xew.protocol import TEST_SEED_START
+from xew.protocol import TEST_SEED_START, CameraSpec
 
 TASKS, SEEDS, ROBOTS = ("place_empty_cup", "beat_block_hammer"), (0, 1), ("piper", "arx_x5")
 
@@ -90,6 +90,26 @@ def test_an_episode_has_files_of_its_own(exported: Path) -> None:
             assert container.streams.video[0].average_rate == Fraction(50, 3)
 
 
+def test_every_view_has_a_video_by_robotwin_s_name(data: Path, tmp_path: Path) -> None:
+    views = {"head": "cam_head", "wrist_left": "cam_left_wrist", "shelf_160x120": "shelf_160x120"}
+    few = tmp_path / "data"
+    write_synthetic_data(few, TASKS[:1], SEEDS[:1], ROBOTS)
+    write_synthetic_view(few, CameraSpec("wrist_left", "left_tool"))
+    write_synthetic_view(few, CameraSpec("shelf", size=(160, 120)))
+    out = tmp_path / "lerobot"
+    export(Args(few, out, views=tuple(views)))
+    features = json.loads((out / "meta/info.json").read_text())["features"]
+    folder = find_accepted(few)[0][0]
+    for view, name in views.items():
+        key = f"observation.images.{name}"
+        expected = read_video(view_episode(folder, view) / "rgb.mkv")
+        frames, _ = decoded(out / "videos" / key / "chunk-000/file-000.mp4")
+        assert features[key]["shape"] == list(expected.shape[1:]) and features[key]["info"]["video.width"] == expected.shape[2]
+        assert np.abs(frames.astype(int) - expected).mean() < 2.5
+    with pytest.raises(EpisodeError, match=r"has no view 'side', but head, shelf_160x120, wrist_left; add it by"):
+        export(Args(few, tmp_path / "other", views=("side",)))
+
+
 def test_a_red_block_stays_red(tmp_path: Path) -> None:
     video = np.full((4, HEIGHT, WIDTH, 3), 255, np.uint8)
     video[:, 80:160, 100:200] = (200, 30, 20)
@@ -101,6 +121,7 @@ def test_a_red_block_stays_red(tmp_path: Path) -> None:
 
 def test_frames_of_another_size_are_refused(tmp_path: Path) -> None:
     film = lerobot._VideoFiles(tmp_path / "observation.images.head", Fraction(25))
+    film.add(np.zeros((2, 240, 320, 3), np.uint8))
     with pytest.raises(EpisodeError, match="frames of 640x480, expected 320x240"):
         film.add(np.zeros((2, 480, 640, 3), np.uint8))
 

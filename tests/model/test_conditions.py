@@ -32,6 +32,7 @@ from xew.model.conditions import (
 )
 from xew.model.episodes.commands import episode_command
 from xew.protocol import ACTION_DIM, ROBOT_NAMES
+from xew.sim_warp.geometry.camera import look_at
 from xew.sim_warp.robots import ROBOTS, keep_robot
 
 STORED = [condition for condition in (ACTIONS["joints"], CONDITIONS["robot_render"]) if isinstance(condition, Condition)]
@@ -49,8 +50,22 @@ def episode(tmp_path: Path) -> Path:
 def test_a_command_holds_nothing_measured() -> None:
     """`rendered` is the video at `render_path`, at hand or rendered anew from the commands (pixels.py); of the scene there is
     the first frame, whether its video is at hand or not."""
-    named = {"robot", "action", "intrinsics", "extrinsics", "render_path", "rendered", "data", "read_first"}
+    named = {"robot", "action", "intrinsics", "extrinsics", "render_path", "rendered", "data", "read_first", "size", "parts"}
     assert {field.name for field in fields(Command)} == named
+
+
+@pytest.mark.parametrize("size", [(320, 240), (640, 480), (160, 120)])
+def test_the_camera_s_numbers_are_those_of_its_rays(size: tuple[int, int], episode: Path) -> None:
+    """A picture of 4:3 of any size has the head camera's numbers; a camera that moves has its own place at each frame."""
+    still, action = look_at((0, -0.4, 1.3), (0, 0, 0.7), width=size[0], height=size[1]), np.zeros((3, 16), np.float32)
+    expected = look_at((0, -0.4, 1.3), (0, 0, 0.7))
+    command = Command("piper", action, still.intrinsics, still.extrinsics, episode / "robot.mkv", size=size)
+    numbers = camera(command)
+    k = expected.intrinsics
+    np.testing.assert_allclose(numbers[:, :4], [[k[0, 0], k[1, 1], k[0, 2], k[1, 2]]] * 3, rtol=1e-6)
+    np.testing.assert_allclose(numbers[:, 13:], [expected.position] * 3, atol=1e-6)
+    places = np.stack([look_at((x, -0.4, 1.3), (0, 0, 0.7)).extrinsics for x in (0.0, 0.1, 0.2)])
+    np.testing.assert_allclose(camera(replace(command, extrinsics=places))[:, 13], [0.0, 0.1, 0.2], atol=1e-6)
 
 
 def test_the_first_frame_is_all_of_the_scene_that_a_command_shows(episode: Path) -> None:

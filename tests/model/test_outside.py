@@ -15,6 +15,7 @@ from xew.dataset import find_records
 from xew.episode import read_record, read_states, read_video, write_episode
 from xew.model import outside
 from xew.model.outside import read_inputs
+from xew.protocol import CameraSpec
 from xew.rollout import RolloutError, find_rollouts, read_rollout_video
 
 FRAMES = 9
@@ -29,6 +30,15 @@ def floats(inputs):
 
 def short(inputs):
     return small(inputs)[1:]
+
+class Views:
+    views = ("head", "wrist_left")
+
+    def __call__(self, inputs):
+        assert inputs.first_frame.shape == (120, 160, 3) and inputs.extrinsics.shape == (4, 4)
+        assert inputs.views["head"].first_frame.shape == (240, 320, 3)
+        assert inputs.views["wrist_left"].extrinsics.shape == (inputs.frame_count, 4, 4)
+        return inputs.first_frame[None].repeat(inputs.frame_count, 0)
 
 number = 3
 """
@@ -59,6 +69,20 @@ def test_rollouts_have_the_rate_of_their_episode(rate: float, data: Path, tmp_pa
     assert len(read_rollout_video(rollout, frame_rate=rate)) == FRAMES
     with pytest.raises(RolloutError, match=f"has {rate:.2f} frames per second, its episode 16.67"):
         read_rollout_video(rollout, frame_rate=1000 / 60)
+
+
+def test_a_model_is_given_the_views_that_it_asks_for(data: Path, tmp_path: Path) -> None:
+    """It predicts one view, whose pictures have another size, and sees the head camera and a camera on the hand too."""
+    copy = tmp_path / "data"
+    shutil.copytree(data, copy)
+    synthetic.write_synthetic_view(copy, CameraSpec("shelf", size=(160, 120)))
+    synthetic.write_synthetic_view(copy, CameraSpec("wrist_left", "left_tool", (-0.1, 0, 0), (0, 0, 0)))
+    arguments = ["--data", str(copy), "--view", "shelf_160x120", "--robots", "piper", "--out", str(tmp_path / "out")]
+    outside.main(["own_models_of_test:Views", *arguments])
+    (rollout,) = find_rollouts(tmp_path / "out")
+    record = read_record(copy / "views/shelf_160x120/place_empty_cup/1000000/piper")
+    assert rollout.header["source_hash"] == record.hashes["rgb"]
+    assert read_rollout_video(rollout).shape == (FRAMES, 120, 160, 3)
 
 
 def truth(data: Path, made: object) -> np.ndarray:

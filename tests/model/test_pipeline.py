@@ -12,13 +12,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from tests import synthetic
 from tests.networks import TINY_CODEC
-from xew.dataset import find_records, read_dataset
-from xew.episode import HEIGHT, WIDTH, read_video
+from xew.dataset import find_accepted, find_records, read_dataset, view_folder
+from xew.episode import HEIGHT, WIDTH, read_record, read_video, verify_episode
+from xew.metrics.evaluate import grade_tables
+from xew.metrics.grading.settings import Args
 from xew.model import latents, rollout, train
 from xew.model.cache.clips import clip_starts
 from xew.model.codecs.contract import decode_to_pictures, encode_pictures
@@ -28,8 +31,9 @@ from xew.model.runs.log import RunLog
 from xew.model.runs.roundtrip import open_roundtrip
 from xew.model.training.data import ClipSource, fake_batch
 from xew.model.training.order import make_dataset
-from xew.protocol import SEEN_ROBOTS
+from xew.protocol import SEEN_ROBOTS, CameraSpec
 from xew.rollout import find_rollouts, read_rollout_video
+from xew.sim_warp.inspection.checks import tile_views
 
 FRAMES = 12
 CONFIG = """
@@ -121,6 +125,60 @@ def test_samples_are_graded_next_to_the_pasted_render(run: Path) -> None:
     accumulator = EventAccumulator(str(run))
     accumulator.Reload()
     assert "validation/seen/ur5_wsg" in accumulator.Tags()["images"]
+
+
+def test_a_view_is_trained_and_rolled_out_at_its_size(world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    data, wrist = tmp_path / "data", CameraSpec("wrist_left", "left_tool", (-0.1, 0, 0), (0, 0, 0), size=(160, 120))
+    synthetic.write_synthetic_data(data, seeds=(0, 1_000_000), robots=SEEN_ROBOTS, frames=FRAMES)
+    config = [str(world / "config.yaml"), "--data", str(data), "--view", wrist.view, "--out", str(tmp_path / "run")]
+    assert f"has no view '{wrist.view}', but head; add it by" in refusal(latents.main, config, capsys)
+    synthetic.write_synthetic_view(data, wrist)
+    latents.main(config)
+    assert sorted(path.name for path in tmp_path.glob("data-latents/*")) == ["views"], "the head camera's cache is another"
+    train.main(config)
+    rollout.main([str(tmp_path / "run"), "--out", str(tmp_path / "out")])
+    made = find_rollouts(tmp_path / "out")
+    assert len(made) == len(SEEN_ROBOTS) and made[0].header["config"]["view"] == wrist.view
+    truth = read_record(view_folder(data, wrist.view) / made[0].task / f"{made[0].seed:07d}" / made[0].robot)
+    assert made[0].header["source_hash"] == truth.hashes["rgb"]
+    assert read_rollout_video(made[0]).shape == (FRAMES, 120, 160, 3)
+    table = tmp_path / "scores.parquet"
+    grade_tables(Args((tmp_path / "out",), data, table, metrics=("psnr", "mask_iou"), view=wrist.view))
+    assert np.isfinite(pd.read_parquet(table)["value"]).all()
+    assert (tmp_path / "data-baselines/views" / wrist.view).is_dir() and not list((data / "views").glob("*-*"))
+
+
+def test_three_views_are_one_picture_and_their_rollouts_are_cut(world: Path, tmp_path: Path) -> None:
+    data, views = tmp_path / "data", ("head", "wrist_left", "side")
+    synthetic.write_synthetic_data(data, seeds=(0, 1_000_000), robots=SEEN_ROBOTS, frames=FRAMES)
+    synthetic.write_synthetic_view(data, CameraSpec("wrist_left", "left_tool", (-0.1, 0, 0), (0, 0, 0)))
+    synthetic.write_synthetic_view(data, CameraSpec("side"))
+    tile_views(find_accepted(data), views)
+    tiled = view_folder(data, "+".join(views))
+    assert all(verify_episode(folder).camera.size == (320, 720) for folder, _ in find_accepted(tiled))
+    config = [
+        str(world / "config.yaml"),
+        "--data",
+        str(data),
+        "--view",
+        tiled.name,
+        "--clip.height",
+        "192",
+        "--clip.width",
+        "80",
+    ]
+    config += ["--out", str(tmp_path / "run"), "--train.samples", "0"]
+    latents.main(config)
+    train.main(config)
+    rollout.main([str(tmp_path / "run"), "--robots", "ur5_wsg", "--out", str(tmp_path / "out")])
+    (whole,) = find_rollouts(tmp_path / "out")
+    video = read_rollout_video(whole)
+    assert video.shape == (FRAMES, 720, 320, 3)
+    for number, view in enumerate(views):
+        (cut,) = find_rollouts(tmp_path / "out-views" / view)
+        np.testing.assert_array_equal(read_rollout_video(cut), video[:, 240 * number : 240 * (number + 1)])
+        folder = view_folder(data, view) / cut.task / f"{cut.seed:07d}" / cut.robot
+        assert cut.header["source_hash"] == read_record(folder).hashes["rgb"]
 
 
 def test_existing_run_is_not_touched_unasked(world: Path, run: Path, capsys: pytest.CaptureFixture[str]) -> None:

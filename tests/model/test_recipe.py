@@ -43,6 +43,7 @@ DIFFERS: dict[str, set[str]] = {
     "fewshot/full": FEWSHOT,
     "fewshot/lora": FEWSHOT | {"adapt.lora_rank"},
     "fewshot/replay": FEWSHOT | {"adapt.replay"},
+    "three_views": {"out", "view", "clip.height", "clip.width"},
     "wan5b/fixed": WAN5B,
     "wan5b/fewshot": WAN5B - {"model.weights"} | {"adapt.start_from", "adapt.robots", "train.samples"},
 }

@@ -11,7 +11,7 @@ from tests import synthetic
 from tests.networks import TINY_CODEC
 from xew.episode import EpisodeError
 from xew.model import latents, release, train
-from xew.model.rollout import load_predictor
+from xew.model.loading import load_predictor
 from xew.model.runs.checkpoint import find_damage, load_params
 from xew.model.runs.folder import load_run_config
 

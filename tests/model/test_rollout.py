@@ -26,8 +26,8 @@ from xew.model.codecs.contract import encode_pictures
 from xew.model.experiment import Experiment, load_experiment
 from xew.model.network.dit import WorldModel
 from xew.model.network.dit_layouts import save_dit
-from xew.model.rollout import RolloutWriter
 from xew.model.sampling.predict import ChunkInputs, Predictor, guided_velocity, make_predictor
+from xew.model.sampling.writing import RolloutWriter
 from xew.protocol import ROBOT_NAMES
 from xew.rollout import find_rollouts, read_rollout_video
 
@@ -102,7 +102,7 @@ def test_later_chunks_continue_the_predicted_and_never_read_the_recorded(
     write_video(tmp_path / "rgb.mkv", video)
     changed = replace(record, hashes=record.hashes | {"rgb": array_hash(video)})
     np.testing.assert_array_equal(predictor.predict([(tmp_path, changed)], FRAMES), before)
-    chunks = predictor.begin([predictor.read(episode)], FRAMES).chunks
+    chunks = predictor.begin([predictor.reader.read(episode)], FRAMES).chunks
     assert len(chunks) == 3
     reference = encode_pictures(predictor.codec, np.asarray(chunks[0])[:, -1:])
     expected = predictor.codec.decode(np.asarray(reference)[0])[0]
@@ -207,7 +207,7 @@ predictor = random_predictor(experiment)
 mesh = make_mesh(MeshSettings())
 predictor = replace(predictor, params=jax.device_put(predictor.params, replicated_sharding(mesh)))
 episodes = choose_tests(experiment.data)[:3]
-begun = predictor.begin([predictor.read(episode) for episode in episodes], FRAMES)
+begun = predictor.begin([predictor.reader.read(episode) for episode in episodes], FRAMES)
 assert len(begun.chunks[0].sharding.device_set) == 2 and begun.chunks[0].shape[0] == 4
 np.save({out!r}, begun.fetch())
 """

@@ -19,7 +19,7 @@ import warp as wp
 from tests.sim_warp.small import SLOW, TASK, WITH_SLOW, fill_disk, produce, work_inline
 from tests.sim_warp.worker_jobs import half, name_of_own_device
 from xew.config import ConfigError
-from xew.dataset import find_accepted, find_records
+from xew.dataset import find_accepted, find_records, view_folder
 from xew.episode import EpisodeError, Record, episode_folder, read_record, verify_episode, write_episode
 from xew.protocol import SEED_STARTS, TEST_SEED_START, VALIDATION_SEED_START, seed_split
 from xew.sim_warp import generate as command
@@ -86,6 +86,21 @@ def test_own_motion_is_on_record_and_never_mixed_with_shared_motion(tmp_path: Pa
     header.write_text(json.dumps(fields | {"motion": "fast"}))
     with pytest.raises(EpisodeError, match="its motion is 'fast', expected shared or own"):
         read_record(folder)
+
+
+def test_views_are_made_of_accepted_episodes_and_change_no_file(
+    undisturbed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = Path(shutil.copytree(undisturbed, tmp_path / "data"))
+    before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+    flags = [*FLAGS, "--out", str(out), "--workers", "1", "--cameras", "head", "wrist_left", "--size", "96x64"]
+    monkeypatch.setattr(sys, "argv", ["generate", *flags])
+    main()
+    assert all(path.read_bytes() == content for path, content in before.items())
+    for view in ("head_96x64", "wrist_left_96x64"):
+        seen = find_accepted(view_folder(out, view))
+        assert {record.seed for _, record in seen} == set(ACCEPTED) and len(seen) == len(ROBOTS) * len(ACCEPTED)
+        assert verify_episode(seen[0][0]).camera.size == (96, 64)
 
 
 def test_what_was_rejected_is_on_record_with_its_reason(undisturbed: Path) -> None:
@@ -200,6 +215,9 @@ def test_a_full_disk_in_a_worker_is_one_line(
         (("--robots", "tests.sim_warp.small:CLOSE"), "is a Task; expected a RobotSpec"),
         (("--train-seeds", "-1"), "tasks, 5 robots, -1 training"),
         (("--batch", "0"), "a batch from 1"),
+        (("--cameras", "wrist"), "error: there is no camera 'wrist'; did you mean 'wrist_left'?"),
+        (("--cameras", "side", "--size", "640"), "error: the size is '640'; expected WIDTHxHEIGHT such as 640x480"),
+        (("--cameras", "side", "--states-only"), "error: --cameras makes videos, and --states-only stores none"),
         (("--device", "gpu"), "error: --device gpu: not on this machine, which has cpu"),
     ],
 )

@@ -13,8 +13,12 @@ import numpy as np
 import pytest
 
 from tests.sim_warp.small import SLOW, TASK, WITH_SLOW, produce
+from xew.config import ConfigError
+from xew.dataset import VIEWS, list_views, view_episode
 from xew.episode import States, episode_folder, read_record, read_states, read_video, write_episode
+from xew.model.episodes.commands import episode_command
 from xew.names import folder_name
+from xew.sim_warp.cameras import place_camera
 from xew.sim_warp.inspect import main, read_headers
 from xew.sim_warp.inspection.pictures import (
     GAP,
@@ -32,6 +36,7 @@ from xew.sim_warp.inspection.visibility import visibility_section
 from xew.sim_warp.production.cells import Job
 from xew.sim_warp.production.surfaces import Seen, Visibility, count_visible, read_surfaces
 from xew.sim_warp.rendering.render import Renderer
+from xew.sim_warp.robots import get_robot
 
 ROBOTS = ("franka_panda", SLOW)
 Inspect = Callable[..., tuple[int, str, str]]
@@ -95,6 +100,84 @@ def test_videos_that_were_left_out_are_made_on_demand(made: Path, tmp_path: Path
         np.testing.assert_array_equal(read_video(folder / "rgb.mkv"), read_video(written / "rgb.mkv"))
     assert "2 of 2 episodes agree with their hashes" in inspect(data, "--verify")[1]
     assert "videos of 0 episodes made" in inspect(data, "--render")[1]
+
+
+def tree_bytes(root: Path) -> dict[str, bytes]:
+    """Content of all files below a folder, by path; without the views."""
+    files = (path for path in root.rglob("*") if path.is_file())
+    return {str(path.relative_to(root)): path.read_bytes() for path in files if VIEWS not in path.relative_to(root).parts}
+
+
+def test_views_are_added_and_the_head_camera_s_episodes_keep_their_bytes(data: Path, tmp_path: Path, inspect: Inspect) -> None:
+    before = tree_bytes(data)
+    code, out, _ = inspect(data, "--render", "--cameras", "head", "wrist_left", "--size", "160x120")
+    assert code == 0 and "view head_160x120: 2 of 2 episodes new\nview wrist_left_160x120: 2 of 2 episodes new" in out
+    assert tree_bytes(data) == before
+    assert b"camera" not in before[f"{folder_name(TASK)}/0000000/franka_panda/episode.json"]
+    assert list_views(data) == ["head_160x120", "wrist_left_160x120"]
+    assert "view head_160x120: 0 of 2 episodes new" in inspect(data, "--render", "--cameras", "head", "--size", "160x120")[1]
+    out = inspect(data, "--verify", "--rerender", 6)[1]
+    assert "6 of 6 episodes agree with their hashes" in out and "6 episodes rendered again" in out
+    folder = view_episode(episode_folder(data, TASK, 0, "franka_panda"), "wrist_left_160x120")
+    record, states = read_record(folder), read_states(folder)
+    assert record.camera.fixed_to == "left_tool" and record.camera.position[2] > 0.07
+    assert states.extrinsics.shape == (12, 4, 4) and states.robot_mask.shape == (12, 120, 160)
+    assert read_video(folder / "rgb.mkv").shape == read_video(folder / "robot.mkv").shape == (12, 120, 160, 3)
+    assert states.robot_mask.any((1, 2)).all()
+    assert inspect(data, "--pictures", tmp_path / "sheets", "--views", "head", "wrist_left_160x120")[0] == 0
+    sheet = cv2.imread(str(tmp_path / "sheets" / f"{folder_name(TASK)}_0.png"))
+    assert sheet.shape[1] == LABEL_WIDTH + 6 * (320 + GAP)
+    view = data / "views" / "wrist_left_160x120"
+    assert inspect(view, "--grid", tmp_path / "grid.png")[0] == 0
+    assert f"{view} is a view; add views to its data set: {data}" in inspect(view, "--render", "--cameras", "side")[2]
+
+
+def test_conditions_of_a_view_are_drawn_for_its_commanded_camera(data: Path, inspect: Inspect) -> None:
+    """The camera of a tiled view's lower picture is on the hand, as the commands move it."""
+    views = ("side_160x120", "wrist_right_160x120")
+    inspect(data, "--render", "--cameras", "side", "wrist_right", "--size", "160x120", "--tile", *views)
+    base = episode_folder(data, TASK, 0, "franka_panda")
+    above, below, tiled = (view_episode(base, view) for view in (*views, "+".join(views)))
+    robot = read_video(tiled / "robot.mkv")
+    np.testing.assert_array_equal(robot, np.concatenate([read_video(part / "robot.mkv") for part in (above, below)], axis=1))
+    command = episode_command(tiled, read_record(tiled))
+    np.testing.assert_array_equal(command.streams.render, robot)
+    assert command.streams.mask[:, 120:].any() and command.streams.optical_flow.shape == (12, 240, 160, 2)
+    on_hand = episode_command(below, read_record(below))
+    states = read_states(below)
+    expected = place_camera(read_record(below).camera, get_robot("franka_panda"), states.action)
+    np.testing.assert_array_equal(on_hand.extrinsics, expected.extrinsics)
+    assert np.abs(states.action - states.joint_pos).max() > 1e-4 and not np.array_equal(on_hand.extrinsics, states.extrinsics)
+    with pytest.raises(ConfigError, match="carried_render needs one camera that stands still"):
+        _ = on_hand.carried_scene
+    out = inspect(data, "--verify", "--rerender", 9)[1]
+    assert "8 of 8 episodes agree" in out and "6 episodes rendered again" in out
+
+
+def test_a_damaged_view_is_named(data: Path, inspect: Inspect) -> None:
+    inspect(data, "--render", "--cameras", "side", "--size", "160x120")
+    folder = view_episode(episode_folder(data, TASK, 0, "franka_panda"), "side_160x120")
+    edit_header(folder, hashes=read_record(folder).hashes | {"robot": "0" * 64})
+    code, _, told = inspect(data, "--verify")
+    assert code == 2 and f"{folder}: robot has hash" in told
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (("--cameras", "wrist_left"), "wrist_left: views are made by --render; add it"),
+        (("--render", "--cameras", "wrist"), "there is no camera 'wrist'"),
+        (("--render", "--cameras", "head", "--size", "640x481"), "the size is '640x481'; expected WIDTHxHEIGHT"),
+        (("--render", "--cameras", "none.yaml"), "cannot read the config none.yaml"),
+        (("--pictures", "sheets", "--views", "wrist_left"), "has no view 'wrist_left', but head; add it by"),
+    ],
+)
+def test_views_that_cannot_be_made_or_shown_are_told_in_one_line(
+    flags: tuple[str, ...], message: str, made: Path, tmp_path: Path, inspect: Inspect, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    code, _, told = inspect(made, *flags)
+    assert code == 2 and message in told and told.count("\n") == 1
 
 
 def test_every_damaged_episode_is_named(data: Path, inspect: Inspect) -> None:

@@ -56,7 +56,17 @@ def test_the_robot_is_outlined_and_its_keypoints_are_dots() -> None:
 def test_half_size_is_the_mean_of_four_pixels() -> None:
     image = np.zeros((4, 6, 3), np.uint8)
     image[::2, ::2] = 100
-    assert (inspect._halve(image) == 25).all() and inspect._halve(image).shape == (2, 3, 3)
+    half = inspect.fit_picture(image, 2, 3)
+    assert (half == 25).all() and half.shape == (2, 3, 3)
+
+
+@pytest.mark.parametrize("shape", [(240, 320), (480, 640), (720, 320), (120, 160)])
+def test_a_picture_of_any_size_fits_into_a_sheet(shape: tuple[int, int]) -> None:
+    image = np.full((*shape, 3), 7, np.uint8)
+    fitted = inspect.fit_picture(image)
+    height, width = (np.array(shape) * min(240 / shape[0], 320 / shape[1])).round().astype(int)
+    assert fitted.shape == (240, 320, 3) and (fitted[:height, :width] == 7).all()
+    assert (fitted[height:] == 255).all() and (fitted[:, width:] == 255).all()
 
 
 def test_cells_are_found_by_task_and_seed_in_their_order() -> None:

@@ -52,7 +52,7 @@ from xew.analysis.tables.table import (
     parting_note,
 )
 from xew.config import ConfigError, user_errors
-from xew.dataset import demand_one_motion, find_records
+from xew.dataset import demand_one_change, demand_one_motion, find_records
 from xew.episode import Record, episode_folder, read_pixels
 from xew.files import hold_lock, write_bytes, write_text
 from xew.names import csv_text, plain_markdown
@@ -99,6 +99,8 @@ class Args:
     """Folder that python -m xew.analysis.distance wrote, for a study; without it the paper's distances are used."""
     other_motion: Path | None = None
     """Score table of the same study in the other kind of motion, to compare action representations."""
+    shifted: tuple[Path, ...] = ()
+    """Score tables of the model of the part `shifts` on changed scenes, one for each change."""
     explorer: bool = False
     """Write <out>/explorer too, a page that plays the scenes of the strips, for the report of one run."""
     paper: bool = False
@@ -122,20 +124,21 @@ def main(args: Args) -> None:
             _report_paper(args)
         elif args.scores:
             scores = read_scores(args.scores, _own_robots(args.data))
-            _check_motion(args, scores)
+            _check_data(args, scores)
             (_report_study if scores.of_study else _report_scores)(args, scores)
         else:
             raise ConfigError("no score table was named: give the one that xew.metrics.evaluate wrote, or --paper.")
     print(f"report: {args.out / 'index.html'}")
 
 
-def _check_motion(args: Args, scores: Scores) -> None:
+def _check_data(args: Args, scores: Scores) -> None:
     records = [record for _, record in find_records(args.data)] if args.data else []
     motion = demand_one_motion(args.data, records) if args.data and records else scores.motion
-    if motion != scores.motion:
+    change = demand_one_change(args.data, records) if args.data and records else scores.change
+    if (motion, change) != (scores.motion, scores.change):
         raise ConfigError(
-            f"{args.data} has episodes of {motion} motion, {args.scores} has scores of {scores.motion} motion; name the data"
-            " that was graded."
+            f"{args.data} has episodes of {motion} motion with {change or 'no'} change, {args.scores} has scores of "
+            f"{scores.motion} motion with {scores.change or 'no'} change; name the data that was graded."
         )
 
 
@@ -165,15 +168,17 @@ def _report_study(args: Args, scores: Scores) -> None:
     if args.data and not any(find_records(args.data)):
         raise ConfigError(f"{args.data} holds no episode; make some: python -m xew.sim_warp.generate --out {args.data}")
     other = read_scores(args.other_motion, _own_robots(args.data)) if args.other_motion else None
-    report = report_study.build(scores, args.data, args.rollouts, args.distances, _format_footer(scores.versions), other)
+    shifted = [read_scores(path, _own_robots(args.data)) for path in args.shifted]
+    others = report_study.Others(other, shifted)
+    report = report_study.build(scores, args.data, args.rollouts, args.distances, _format_footer(scores.versions), others)
     _write_report(args.out, report.html, (report.markdown, report.files), report.summary)
 
 
 def _report_scores(args: Args, scores: Scores) -> None:
-    if args.distances or args.other_motion:
+    if args.distances or args.other_motion or args.shifted:
         raise ConfigError(
-            f"--distances and --other-motion are for the report of a study, and {args.scores} is the table of one run; leave "
-            "them out."
+            f"--distances, --other-motion and --shifted are for the report of a study, and {args.scores} is the table of one "
+            "run; leave them out."
         )
     own = [robot for robot in dict.fromkeys(scores.rows["robot"]) if robot not in ROBOT_NAMES]
     for robot in args.held_out:

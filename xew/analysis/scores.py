@@ -41,8 +41,8 @@ MOST_ROWS, MOST_BYTES = 10, 100
 """Largest number of rows, and of bytes of content, that a file may declare per byte of its size."""
 COPY, TRUTH = COPY_FIRST_FRAME, GROUND_TRUTH
 """Baselines that others are measured by: the frozen first frame, and the true video, which is the ceiling."""
-COMPARABLE = ("protocol", "metrics", "estimators", "frame_zero", "motion")
-"""Attributes that say how a table was graded, and on what motion; tables that differ in one cannot be compared."""
+COMPARABLE = ("protocol", "metrics", "estimators", "frame_zero", "motion", "change")
+"""Attributes that say how a table was graded, and on what scenes; tables that differ in one cannot be compared."""
 REQUIRED = ("dimension", "unit", "higher_is_better", "low", "high", "reference", "estimated")
 LISTED = 20
 """Largest number of rows of each kind that an error names; it counts the others."""
@@ -122,6 +122,11 @@ class Scores:
         return self.attributes.get("motion", SHARED_MOTION)
 
     @property
+    def change(self) -> str:
+        """Change of the graded scenes, as FACTOR:LEVEL (`xew.protocol.parse_change`) or random; empty if there is none."""
+        return self.attributes.get("change", "")
+
+    @property
     def codecs(self) -> dict[str, list[str]]:
         """By model (of a study by variant): conditions of the truth through its codec, of which its noise floor is."""
         return dict(self.attributes.get("codecs", {}))
@@ -137,6 +142,7 @@ class Scores:
             "frame 0": self.frame_zero,
             "changed to fit": allowed,
             "motion": self.motion,
+            **({"change": self.change} if self.change else {}),
         }
 
     @property
@@ -352,6 +358,7 @@ class _Attributes:
     study: dict[str, Any] = field(default_factory=dict)
     codecs: dict[str, tuple[str, ...]] = field(default_factory=dict)
     motion: Literal["shared", "own"] = "shared"
+    change: str = ""
 
 
 def _check_attributes(path: Path, attributes: Mapping[Hashable, Any]) -> None:

@@ -52,7 +52,9 @@ def main(args: Args) -> None:
 def merge_and_report(args: Args, study: Study) -> None:
     """Write the merged table of what is graded, and its report. Raises ConfigError where nothing is."""
     planned = {run.name: run for run in study.planned_runs}
-    graded = args.variants or tuple(name for name in planned if study.scores_path(name).exists())
+    asked = args.variants or tuple(name for name in (*planned, *study.shifted_runs) if study.scores_path(name).exists())
+    shifted = tuple(study.scores_path(name) for name in asked if name in study.shifted_runs)
+    graded = tuple(name for name in asked if name not in study.shifted_runs)
     if not graded:
         raise ConfigError(f"{args.study} has no graded variant yet; run python -m xew.analysis.study {args.study}/study.yaml")
     tables = [(planned[name].of if name in planned else name, study.scores_path(name)) for name in graded]
@@ -76,7 +78,7 @@ def merge_and_report(args: Args, study: Study) -> None:
     check_place(out / "index.html", within=args.study)
     remove_written(out, report.FILES)  # a larger study's figures would stay
     other = study.other_scores
-    report.main(report.Args(table, data, rollouts, out, distances=args.distances, other_motion=other))
+    report.main(report.Args(table, data, rollouts, out, distances=args.distances, other_motion=other, shifted=shifted))
 
 
 def describe(study: Study, scores: Scores) -> dict[str, Any]:

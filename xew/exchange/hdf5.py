@@ -41,6 +41,18 @@ TABLE_CENTER = (0.0, 0.0, 0.74)
 
 
 @dataclass(frozen=True)
+class OtherCamera:
+    """What another camera than the head camera recorded."""
+
+    rgb: np.ndarray
+    """[t h w 3] uint8."""
+    intrinsics: np.ndarray
+    """[3 3] pixels, (0, 0) the center of the upper left one."""
+    extrinsics: np.ndarray
+    """[t 4 4] world to camera."""
+
+
+@dataclass(frozen=True)
 class Recorded:
     """One RoboTwin episode in xew's units, frames and orders."""
 
@@ -62,6 +74,8 @@ class Recorded:
     """Instruction; empty if there is none."""
     frame_rate: float
     """Frames per second."""
+    cameras: dict[str, OtherCamera]
+    """Other cameras of the file, by xew's names."""
 
 
 @dataclass(frozen=True)
@@ -91,6 +105,8 @@ class Layout:
     intrinsics: str
     extrinsics: tuple[str, ...]
     """Alternatives; the first that a file has is read."""
+    cameras: dict[str, str]
+    """Groups of the other cameras by xew's names; their datasets are named as the head camera's."""
 
 
 LEGACY = Layout(
@@ -101,6 +117,11 @@ LEGACY = Layout(
     pictures="observation/head_camera/rgb",
     intrinsics="observation/head_camera/intrinsic_cv",
     extrinsics=("observation/head_camera/extrinsic_cv", "observation/head_camera/cam2world_gl"),
+    cameras={
+        "wrist_left": "observation/left_camera",
+        "wrist_right": "observation/right_camera",
+        "front": "observation/front_camera",
+    },
 )
 MODERN = Layout(
     "1.0",
@@ -110,6 +131,11 @@ MODERN = Layout(
     pictures="vision/cam_head/colors",
     intrinsics="vision/cam_head/intrinsic_matrix",
     extrinsics=("vision/cam_head/extrinsic_matrix", "vision/cam_head/extrinsics_matrix"),
+    cameras={
+        "wrist_left": "vision/cam_left_wrist",
+        "wrist_right": "vision/cam_right_wrist",
+        "front": "vision/cam_third_view",
+    },
 )
 """Version 1.0: `state` is in force at a frame; `action` is the state of the next frame and is not read."""
 
@@ -198,23 +224,47 @@ def _read(reader: "_Reader", layout: Layout, options: ReadOptions) -> Recorded:
     rgb, width = reader.pictures(layout.pictures, frames, options.colors)
     if any(np.abs(np.linalg.norm(pose[:, 3:], axis=1) - 1).max() > 0.01 for pose in poses):
         raise reader.error("the end poses hold quaternions that are not of length 1", "x y z and a unit quaternion w x y z")
-    matrix = reader.constant(layout.intrinsics, (3, 3))
-    if min(matrix[0, 0], matrix[1, 1]) <= 0:
-        raise reader.error(
-            f"{layout.intrinsics} has the focal lengths {matrix[0, 0]:g} and {matrix[1, 1]:g}", "numbers of pixels over 0"
-        )
+    matrix = _intrinsics(reader, layout.intrinsics, width)
     extrinsics = next((name for name in layout.extrinsics if name in reader.file), layout.extrinsics[0])
+    reading = _find_reading(reader, extrinsics)
     return Recorded(
         layout.name,
         np.stack(arms, 1),
         np.stack(grippers, 1),
         np.stack([tool_center(pose) for pose in poses], 1) if poses else None,
         rgb,
-        _center_pixels(matrix, width / WIDTH),
-        _world_to_camera(reader, extrinsics),
+        matrix,
+        _world_to_camera(reader.constant(extrinsics, None), reading),
         reader.instruction() if options.instruction is None else options.instruction,
         reader.frame_rate(layout) if options.frame_rate is None else options.frame_rate,
+        _other_cameras(reader, layout, frames, options.colors, (extrinsics.rpartition("/")[2], reading)),
     )
+
+
+def _intrinsics(reader: "_Reader", name: str, width: int) -> np.ndarray:
+    """K [3 3] of pictures that had this width and were brought to `WIDTH`."""
+    matrix = reader.constant(name, (3, 3))
+    if min(matrix[0, 0], matrix[1, 1]) <= 0:
+        raise reader.error(f"{name} has the focal lengths {matrix[0, 0]:g} and {matrix[1, 1]:g}", "numbers of pixels over 0")
+    return _center_pixels(matrix, width / WIDTH)
+
+
+def _other_cameras(
+    reader: "_Reader", layout: Layout, frames: int, colors: Colors, extrinsics: tuple[str, int]
+) -> dict[str, OtherCamera]:
+    """The other cameras of a file, whose extrinsics have the name and the reading of the head camera's."""
+    pictures, intrinsics = (name.rpartition("/")[2] for name in (layout.pictures, layout.intrinsics))
+    cameras, (name, reading) = {}, extrinsics
+    for camera, group in layout.cameras.items():
+        if f"{group}/{pictures}" not in reader.file:
+            continue
+        rgb, width = reader.pictures(f"{group}/{pictures}", frames, colors)
+        stored = reader.matrices(f"{group}/{name}", None)
+        if len(stored) not in (1, frames) or stored.shape[1:] not in ((3, 4), (4, 4)):
+            raise reader.error(f"{group}/{name} has shape {stored.shape}", f"one matrix for each of {frames} frames")
+        poses = np.stack([_world_to_camera(matrix, reading) for matrix in np.broadcast_to(stored, (frames, *stored.shape[1:]))])
+        cameras[camera] = OtherCamera(rgb, _intrinsics(reader, f"{group}/{intrinsics}", width), poses)
+    return cameras
 
 
 def tool_center(end_pose: np.ndarray) -> np.ndarray:
@@ -232,8 +282,16 @@ def _center_pixels(intrinsics: np.ndarray, scale: float) -> np.ndarray:
     return centered
 
 
-def _world_to_camera(reader: "_Reader", name: str) -> np.ndarray:
-    """World to camera [4 4] m, from a matrix of either direction, in OpenCV's or OpenGL's camera frame.
+def _world_to_camera(stored: np.ndarray, reading: int) -> np.ndarray:
+    """World to camera [4 4] m, from a matrix [3 4] or [4 4] of either direction, in OpenCV's or OpenGL's frame (0 to 3)."""
+    matrix = np.eye(4)
+    matrix[:3] = stored[:3]
+    direct = matrix if reading % 2 == 0 else np.linalg.inv(matrix)
+    return direct if reading < 2 else OPENGL @ direct
+
+
+def _find_reading(reader: "_Reader", name: str) -> int:
+    """Number of the reading (`_world_to_camera`) of the head camera's matrix.
 
     Of the four readings, the camera must be above the table, see it, and face +y as the robot does. (The inverse of the head
     camera's matrix sees the table too, from the other side.)
@@ -241,17 +299,15 @@ def _world_to_camera(reader: "_Reader", name: str) -> np.ndarray:
     stored = reader.constant(name, None)
     if stored.shape not in ((3, 4), (4, 4)):
         raise reader.error(f"{name} has shape {stored.shape}", "[3 4] or [4 4]")
-    matrix = np.eye(4)
-    matrix[:3] = stored[:3]
-    if not np.allclose(matrix[:3, :3] @ matrix[:3, :3].T, np.eye(3), atol=1e-3):
+    if not np.allclose(stored[:3, :3] @ stored[:3, :3].T, np.eye(3), atol=1e-3):
         raise reader.error(f"{name} holds no rotation", "a rigid transform between world and camera (z forward)")
-    inverse = np.linalg.inv(matrix)
-    for candidate in (matrix, inverse, OPENGL @ matrix, OPENGL @ inverse):
+    for reading in range(4):
+        candidate = _world_to_camera(stored, reading)
         x, y, z, _ = candidate @ [*TABLE_CENTER, 1]
         height = -candidate[:3, 2] @ candidate[:3, 3]
         faces_ahead = candidate[2, 1] > 0
         if height > TABLE_CENTER[2] and faces_ahead and z > 0 and max(abs(x), abs(y)) < z:
-            return candidate
+            return reading
     raise reader.error(
         f"{name} does not see the table", "the head camera in OpenCV's frame (y down, z forward) or OpenGL's (y up)"
     )
@@ -324,13 +380,17 @@ class _Reader:
 
     def constant(self, name: str, shape: tuple[int, ...] | None) -> np.ndarray:
         """A matrix [r c], stored once or equal for every frame."""
-        stored = self.numbers(name, self.dataset(name).ndim)
-        first = stored[0] if stored.ndim == 3 else stored
-        if stored.ndim not in (2, 3) or (shape is not None and first.shape != shape):
-            raise self.error(f"{name} has shape {stored.shape}", f"a matrix {list(shape or (4, 4))}, or one a frame")
-        if stored.ndim == 3 and not np.allclose(stored, first, atol=1e-4):
+        stored = self.matrices(name, shape)
+        if not np.allclose(stored, stored[0], atol=1e-4):
             raise self.error(f"{name} changes during the episode", "a camera that stands still")
-        return first
+        return stored[0]
+
+    def matrices(self, name: str, shape: tuple[int, ...] | None) -> np.ndarray:
+        """Matrices [n r c], stored once or for every frame."""
+        stored = self.numbers(name, self.dataset(name).ndim)
+        if stored.ndim not in (2, 3) or not len(stored) or (shape is not None and stored.shape[-2:] != shape):
+            raise self.error(f"{name} has shape {stored.shape}", f"a matrix {list(shape or (4, 4))}, or one a frame")
+        return stored.reshape(-1, *stored.shape[-2:])
 
     def pictures(self, name: str, frames: int, colors: Colors) -> tuple[np.ndarray, int]:
         """`read_pictures` of a dataset, if its header promises no more than the file can hold."""

@@ -6,16 +6,18 @@ Writes DIR: meta/ (info, tasks, episodes, statistics), data/ (parquet, many epis
     action, observation.state     the canonical 16 numbers, commanded and measured
     observation.tool_pose         14 numbers: left and right tool, x y z [m] and quaternion x y z w, world
     observation.images.head       the head camera; observation.images.robot with --robot-video: the robot alone by its commands
+    observation.images.cam_…      with --views, one video a camera by RoboTwin's names (CAMERA_NAMES)
     next.done, next.success       true at the last frame
 The table of episodes has each episode's robot, task, seed and kind of motion (columns xew/…). A feature that an imported
 episode lacks is omitted for the whole set. `fps` is the episodes' frame rate, 50 / 3 in simulated data; a set has one rate.
 Video is lossy; all other data are exact.
 
-Command: python -m xew.exchange.lerobot DATA --out DIR [--robots … --tasks … --split train --robot-video]
+Command: python -m xew.exchange.lerobot DATA --out DIR [--views head wrist_left wrist_right --robots … --tasks …
+    --split train --robot-video]
 """
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
@@ -30,20 +32,24 @@ import tyro
 from tqdm import tqdm
 
 from xew.config import user_errors
-from xew.dataset import demand_one_rate, read_dataset
-from xew.episode import HEIGHT, WIDTH, EpisodeError, Record, States, complete_folder, data_folder, read_pixels, read_states
+from xew.dataset import demand_one_rate, read_dataset, view_episode
+from xew.episode import EpisodeError, Record, States, complete_folder, data_folder, read_pixels, read_states
 from xew.files import hold_lock
-from xew.protocol import expand_robots
+from xew.protocol import HEAD, expand_robots
 
 VERSION = "v3.0"
 FILES_PER_CHUNK = 1000
 LARGEST_DATA, LARGEST_VIDEO = 100, 200
 """Sizes at which LeRobot's tools begin the next file [MB]; here a video file has one episode."""
+CAMERA_NAMES = {"head": "cam_head", "wrist_left": "cam_left_wrist", "wrist_right": "cam_right_wrist", "front": "cam_third_view"}
+"""RoboTwin 1.0's names of cameras; views of other cameras keep their names."""
 ENCODER = {"crf": "16", "g": "2", "bf": "0", "preset": "veryfast"}
 """Options of x264; every second frame is a key frame, for fast access to single frames."""
 QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 AXES = [f"{side}_{axis}" for side in ("left", "right") for axis in ("x", "y", "z", "qx", "qy", "qz", "qw")]
 JOINTS = [f"{side}_{name}" for side in ("left", "right") for name in (*(f"joint{number}" for number in range(1, 8)), "gripper")]
+Videos = dict[str, tuple[str, str]]
+"""View and name of a video, rgb or robot, by feature."""
 Vectors = dict[str, tuple[str, list[str]]]
 """Array of `States` and names of its numbers, by feature."""
 VECTORS: Vectors = {
@@ -69,6 +75,8 @@ class Args:
     """Tasks to export; default: all in the data."""
     split: Literal["train", "validation", "test", "final"] | None = None
     """Family of seeds; default: all. Export the training seeds to train on the set and grade on xew's test seeds."""
+    views: tuple[str, ...] = ()
+    """Views, each with a video of its own; default: the head camera as observation.images.head."""
     robot_video: bool = False
     """Also export the video of the robot alone, as observation.images.robot."""
 
@@ -107,16 +115,17 @@ def export(args: Args) -> tuple[int, list[str]]:
     return len(chosen), [feature for feature in VECTORS if feature not in vectors]
 
 
-def _select_features(args: Args, chosen: Sequence[tuple[Path, Record]]) -> tuple[Vectors, dict[str, str]]:
-    """Vectors that all episodes have, and file names of videos by feature."""
+def _select_features(args: Args, chosen: Sequence[tuple[Path, Record]]) -> tuple[Vectors, Videos]:
+    """Vectors that all episodes have, and videos."""
     vectors = {
         feature: entry for feature, entry in VECTORS.items() if not any(entry[0] in record.unknown for _, record in chosen)
     }
-    videos = {"observation.images.head": "rgb"}
+    videos = {f"observation.images.{CAMERA_NAMES.get(view, view)}": (view, "rgb") for view in args.views}
+    videos = videos or {"observation.images.head": (HEAD, "rgb")}
     if args.robot_video:
         if without := [folder for folder, record in chosen if "robot" not in record.hashes]:
             raise EpisodeError(f"{without[0]} has no video of the robot alone; omit --robot-video.")
-        videos["observation.images.robot"] = "robot"
+        videos["observation.images.robot"] = (HEAD, "robot")
     return vectors, videos
 
 
@@ -134,7 +143,7 @@ def _select_episodes(args: Args) -> list[tuple[Path, Record]]:
     return chosen
 
 
-def _write(root: Path, chosen: Sequence[tuple[Path, Record]], vectors: Vectors, videos: dict[str, str]) -> None:
+def _write(root: Path, chosen: Sequence[tuple[Path, Record]], vectors: Vectors, videos: Videos) -> None:
     instructions = [record.instruction or record.task for _, record in chosen]
     tasks = {task: index for index, task in enumerate(dict.fromkeys(instructions))}
     rate = demand_one_rate(data_folder(chosen[0][0]), (record for _, record in chosen))
@@ -150,8 +159,8 @@ def _write(root: Path, chosen: Sequence[tuple[Path, Record]], vectors: Vectors, 
             row |= {"data/chunk_index": place.chunk, "data/file_index": place.file}
             row |= {"dataset_from_index": start, "dataset_to_index": start + row["length"]}
             statistics = {name: _statistics(values) for name, values in columns.items()}
-            for key, name in videos.items():
-                video = read_pixels(folder, name, record=record)
+            for key, (view, name) in videos.items():
+                video = read_pixels(view_episode(folder, view), name)
                 row |= video_files[key].add(video)
                 counts = color_counts(video)
                 statistics[key] = _color_statistics(counts, len(video))
@@ -163,7 +172,8 @@ def _write(root: Path, chosen: Sequence[tuple[Path, Record]], vectors: Vectors, 
             episodes.append(row)
             start += row["length"]
     robots = {record.robot for _, record in chosen}
-    _write_meta(root, episodes, tasks, totals, _features(vectors, videos, rate), rate, robots)
+    sizes = {key: files.size for key, files in video_files.items()}
+    _write_meta(root, episodes, tasks, totals, _features(vectors, sizes, rate), rate, robots)
 
 
 def _columns(states: States, vectors: Vectors, rate: Fraction, episode: int, start: int, task: int) -> dict[str, np.ndarray]:
@@ -228,17 +238,21 @@ class _VideoFiles:
 
     def __init__(self, root: Path, rate: Fraction) -> None:
         self.root, self.rate, self.next = root, rate, Place()
+        self.size: tuple[int, int] = (0, 0)
+        """Height and width of the frames [pixels], after the first video."""
 
     def add(self, video: np.ndarray) -> dict[str, Any]:
         """Write the video of an episode [t h w 3] uint8 RGB; returns the columns that locate it.
 
         Raises:
-            EpisodeError: its frames have another size than the data set.
+            EpisodeError: its frames have another size than those of the first video.
         """
-        if video.shape[1:3] != (HEIGHT, WIDTH):
-            size = f"{video.shape[2]}x{video.shape[1]}"
+        height, width = video.shape[1:3]
+        self.size = self.size if any(self.size) else (height, width)
+        if (height, width) != self.size:
             raise EpisodeError(
-                f"an episode has frames of {size}, expected {WIDTH}x{HEIGHT}; exclude it by --robots or --tasks."
+                f"an episode has frames of {width}x{height}, expected {self.size[1]}x{self.size[0]}; exclude it by --robots or "
+                "--tasks."
             )
         place, self.next = self.next, self.next.next_place()
         path = place.path(self.root, "mp4")
@@ -308,13 +322,11 @@ def _color_statistics(counts: np.ndarray, frames: int) -> dict[str, list[Any]]:
     return {name: numbers.reshape(3, 1, 1).tolist() for name, numbers in statistics.items()} | {"count": [frames]}
 
 
-def _features(vectors: Vectors, videos: Iterable[str], rate: Fraction) -> dict[str, dict[str, Any]]:
+def _features(vectors: Vectors, sizes: dict[str, tuple[int, int]], rate: Fraction) -> dict[str, dict[str, Any]]:
     features: dict[str, dict[str, Any]] = {
         name: {"dtype": "float32", "shape": [len(names)], "names": names} for name, (_, names) in vectors.items()
     }
     information = {
-        "video.height": HEIGHT,
-        "video.width": WIDTH,
         "video.channels": 3,
         "video.codec": "h264",
         "video.pix_fmt": "yuv420p",
@@ -323,7 +335,9 @@ def _features(vectors: Vectors, videos: Iterable[str], rate: Fraction) -> dict[s
         "has_audio": False,
     }
     names = ["height", "width", "channels"]
-    features |= {key: {"dtype": "video", "shape": [HEIGHT, WIDTH, 3], "names": names, "info": information} for key in videos}
+    for key, (height, width) in sizes.items():
+        info = {"video.height": height, "video.width": width} | information
+        features[key] = {"dtype": "video", "shape": [height, width, 3], "names": names, "info": info}
     return features | {name: {"dtype": dtype, "shape": [1], "names": None} for name, dtype in SCALARS.items()}
 
 

@@ -24,29 +24,32 @@ from tqdm import tqdm
 
 import xew
 from xew.config import ConfigError, user_errors
+from xew.dataset import VIEWS
 from xew.episode import (
     EpisodeError,
     Record,
     States,
     array_hash,
+    data_folder,
     episode_folder,
     exact_rate,
     read_record,
     read_states,
     write_episode,
 )
-from xew.exchange.hdf5 import ReadOptions, Recorded, read_robotwin, text_beside
+from xew.exchange.hdf5 import OtherCamera, ReadOptions, Recorded, read_robotwin, text_beside
 from xew.exchange.pictures import Colors
 from xew.files import hold_lock
-from xew.names import check_name
-from xew.protocol import ACTION_DIM, FRAME_RATE, OWN_MOTION
+from xew.names import check_name, path_below
+from xew.protocol import ACTION_DIM, FRAME_RATE, OWN_MOTION, CameraSpec
+from xew.sim_warp.cameras import TOOLS, commanded_camera, fixed_frames
 from xew.sim_warp.devices.workers import quiet_warp
-from xew.sim_warp.geometry.camera import Camera
+from xew.sim_warp.geometry.camera import Camera, project
 from xew.sim_warp.geometry.poses import matrix_from_pose, pose_from_matrix
 from xew.sim_warp.kinematics.expert import canonical_commands
 from xew.sim_warp.kinematics.forward import tool_matrix
-from xew.sim_warp.rendering.observe import Recording, keypoint_names, observe
-from xew.sim_warp.rendering.streams import command_renders, default_renderer
+from xew.sim_warp.rendering.observe import keypoint_names, keypoint_positions
+from xew.sim_warp.rendering.streams import command_renders
 from xew.sim_warp.robots import RobotSpec, get_robot, is_path, keep_robot
 from xew.sim_warp.robots.user.draft import find_description, read_draft
 
@@ -113,14 +116,18 @@ def import_episode(path: Path, args: Args) -> Record:
     action = canonical_commands(recorded.arms, recorded.grippers).astype(np.float32)
     folder = episode_folder(args.out, task, seed, name)
     if (folder / "episode.json").is_file():
-        return _check_existing(path, folder, recorded, action)
+        record = _check_existing(path, folder, recorded, action)
+        _write_views(folder, record, robot, recorded)
+        return record
     for neighbor in folder.parent.glob("[!.]*/episode.json"):
         if not read_record(neighbor.parent).source:
             raise EpisodeError(
                 f"{path}: {neighbor.parent} was simulated here; RoboTwin's seed {seed} is another scene. Import it as another "
                 "--task or into another --out."
             )
-    states, names, video = _build_states(robot, action, recorded)
+    camera = Camera(recorded.intrinsics, recorded.extrinsics)
+    states, names = _build_states(robot, action, recorded, camera)
+    video = None if robot is None else command_renders([(robot, action)], camera)[0]
     record = Record(
         task=task,
         seed=seed,
@@ -135,7 +142,39 @@ def import_episode(path: Path, args: Args) -> Record:
         motion=OWN_MOTION,  # RoboTwin plans for each robot separately
         unknown=UNKNOWN if recorded.tool_pose is not None else (*UNKNOWN, "tool_pose"),
     )
-    return read_record(write_episode(args.out, record, states, recorded.rgb, video))
+    record = read_record(write_episode(args.out, record, states, recorded.rgb, video))
+    _write_views(folder, record, robot, recorded)
+    return record
+
+
+def _write_views(folder: Path, record: Record, robot: RobotSpec | None, recorded: Recorded) -> None:
+    """Write the views of the file's other cameras that are missing; without a robot only those of cameras that stand still."""
+    states = read_states(folder, record)
+    for name, seen in recorded.cameras.items():
+        root = path_below(data_folder(folder), VIEWS, name)
+        moves = f"{name.removeprefix('wrist_')}_tool" in TOOLS
+        if (episode_folder(root, record.task, record.seed, record.robot) / "episode.json").is_file() or (moves and not robot):
+            continue
+        spec = _locate_camera(name, seen, robot, states.action)
+        camera = Camera(seen.intrinsics, seen.extrinsics if moves else seen.extrinsics[0])
+        of_view, video = replace(states, intrinsics=camera.intrinsics, extrinsics=camera.extrinsics), None
+        if robot is not None:
+            keypoints, _ = project(camera, keypoint_positions(robot, states.action))
+            of_view = replace(of_view, keypoints=keypoints.astype(np.float32))
+            video = command_renders([(robot, states.action)], commanded_camera(spec, robot, of_view))[0]
+        write_episode(root, replace(record, camera=spec), of_view, seen.rgb, video)
+
+
+def _locate_camera(name: str, seen: OtherCamera, robot: RobotSpec | None, action: np.ndarray) -> CameraSpec:
+    """A recorded camera as data: fixed to the tool as in the first frame, or to the world."""
+    tool = f"{name.removeprefix('wrist_')}_tool"
+    fixed_to = tool if tool in TOOLS and robot is not None else "world"
+    spec = CameraSpec(name, fixed_to)
+    frame = np.eye(4) if robot is None else fixed_frames(spec, robot, action[:1])[0]
+    _, y, z, center = (np.linalg.inv(frame) @ np.linalg.inv(seen.extrinsics[0]))[:3].T
+    fov = 2 * np.degrees(np.arctan(seen.rgb.shape[1] / 2 / seen.intrinsics[1, 1]))
+    position, target, up = (tuple(vector.tolist()) for vector in (center, center + z, -y))
+    return CameraSpec(name, fixed_to, position, target, up, float(fov), (seen.rgb.shape[2], seen.rgb.shape[1]))
 
 
 def _check_existing(path: Path, folder: Path, recorded: Recorded, action: np.ndarray) -> Record:
@@ -261,17 +300,15 @@ def _seed(path: Path) -> int:
 
 
 def _build_states(
-    robot: RobotSpec | None, action: np.ndarray, recorded: Recorded
-) -> tuple[States, tuple[str, ...], np.ndarray | None]:
-    """States, names of keypoints and the robot-only video [t h w 3] of commands [t 16], as far as they are known."""
+    robot: RobotSpec | None, action: np.ndarray, recorded: Recorded, camera: Camera
+) -> tuple[States, tuple[str, ...]]:
+    """States and names of keypoints of commands [t 16], as far as they are known."""
     frames, height, width = recorded.rgb.shape[:3]
-    camera = Camera(recorded.intrinsics, recorded.extrinsics)
     names: tuple[str, ...] = ()
-    keypoints, video = np.zeros((frames, 0, 2), np.float32), None
+    keypoints = np.zeros((frames, 0, 2), np.float32)
     if robot is not None:
         names = keypoint_names(robot)
-        keypoints = observe(default_renderer(), [Recording(robot, action)], camera)[0].keypoints
-        video = command_renders([(robot, action)], camera)[0]
+        keypoints = project(camera, keypoint_positions(robot, action))[0].astype(np.float32)
     nothing = np.full((frames, ACTION_DIM), np.nan, np.float32)
     no_pose = np.full((frames, 2, 7), np.nan)
     states = States(
@@ -289,7 +326,7 @@ def _build_states(
         intrinsics=recorded.intrinsics,
         extrinsics=recorded.extrinsics,
     )
-    return states, names, video
+    return states, names
 
 
 def import_all(paths: Sequence[Path], args: Args) -> tuple[list[Record], list[str]]:

@@ -8,6 +8,7 @@ __all__ = [
     "experiment",
     "export",
     "latents",
+    "loading",
     "outside",
     "release",
     "rollout",

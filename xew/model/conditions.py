@@ -16,13 +16,16 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Shaped, UInt8
 from scipy.spatial.transform import Rotation
 
-from xew.episode import Record, States, data_folder, read_pixels
+from xew.config import ConfigError
+from xew.dataset import view_episode
+from xew.episode import EpisodeError, Record, States, data_folder, read_pixels, read_record, read_states
 from xew.model.video.frames import TEMPORAL_FACTOR
-from xew.protocol import ARMS
+from xew.protocol import ARMS, CAMERA_SIZE
 
 if TYPE_CHECKING:
     import xew.sim_warp.embodiment.spec
@@ -42,9 +45,9 @@ class Command:
     action: Float[np.ndarray, "t 16"]
     """Commanded joints [t 16] float32, in the canonical layout."""
     intrinsics: Float[np.ndarray, "3 3"]
-    """Matrix K [3 3] of the head camera [pixels]."""
-    extrinsics: Float[np.ndarray, "4 4"]
-    """Matrix [4 4] from the world to the head camera's frame."""
+    """Matrix K [3 3] of the camera [pixels]."""
+    extrinsics: Float[np.ndarray, "*t 4 4"]
+    """Matrix [4 4] from the world to the camera's frame, or [t 4 4] of a camera that the commands move."""
     render_path: Path
     """Path of the robot-only video, posed by `action` on white."""
     rendered: Video | None = None
@@ -53,6 +56,10 @@ class Command:
     """Data set of the episode, which may hold custom robots."""
     read_first: Callable[[], Video] | None = None
     """Function that reads the first frame of the scene [1 h w 3] uint8."""
+    size: tuple[int, int] = CAMERA_SIZE
+    """Width and height of the camera's picture [pixels]."""
+    parts: tuple["Command", ...] = ()
+    """The same commands in each view of a tiled picture, from top to bottom."""
 
     @cached_property
     def render(self) -> Video:
@@ -61,10 +68,15 @@ class Command:
 
     @cached_property
     def streams(self) -> "xew.sim_warp.rendering.streams.CommandStreams":
-        """Render, mask and optical flow of the commands; imports Warp."""
-        from xew.sim_warp.rendering.streams import command_streams
+        """Mask and optical flow of the commands; imports Warp."""
+        from xew.sim_warp.rendering.streams import CommandStreams, command_streams
 
-        return command_streams(self.robot_spec, self.action, self.camera)
+        if self.parts:
+            names = ("mask", "optical_flow")
+            return CommandStreams(
+                self.render, *(np.concatenate([getattr(part.streams, name) for part in self.parts], axis=1) for name in names)
+            )
+        return command_streams(self.robot_spec, self.action, self.camera, colors=False)
 
     @cached_property
     def tools(self) -> Float[np.ndarray, "t 2 7"]:
@@ -78,6 +90,11 @@ class Command:
         """The scene without the robot, where closed grippers carry objects of the first frame: [t h w 3] uint8."""
         from xew.model.video.carried_scene import View, carry
 
+        if self.parts or self.extrinsics.ndim == 3:
+            raise ConfigError(
+                "carried_render needs one camera that stands still, and this view is tiled or moves with the robot; use "
+                "--model.embodiment pasted_render or robot_render."
+            )
         assert self.read_first is not None
         grippers = self.action[:, [gripper for _, gripper in ARMS]]
         return carry(self.read_first()[0], self.render, self.tools, grippers, View(self.intrinsics, self.extrinsics))
@@ -94,7 +111,7 @@ class Command:
         """The simulator's camera."""
         from xew.sim_warp.geometry.camera import Camera
 
-        return Camera(self.intrinsics, self.extrinsics)
+        return Camera(self.intrinsics, self.extrinsics, *self.size)
 
 
 def keep_numbers(numbers: Shaped[np.ndarray, "t n"]) -> Shaped[np.ndarray, "t n"]:
@@ -176,12 +193,35 @@ def clip_numbers(
 
 
 def make_command(
-    folder: Path, record: Record, states: States, rendered: Video | None = None, scene: Video | None = None
+    folder: Path,
+    record: Record,
+    states: States,
+    rendered: Video | None = None,
+    scene: UInt8[np.ndarray, "n h w 3"] | None = None,
 ) -> Command:
-    """The command of an episode; videos [t h w 3] as in `episodes.commands.episode_command`."""
+    """The command of an episode; videos [t h w 3] and [n h w 3] as in `episodes.commands.episode_command`."""
     render, data = folder / "robot.mkv", data_folder(folder)
     first = partial(read_pixels, folder, "rgb", most=1, record=record) if scene is None else partial(np.copy, scene[:1])
-    return Command(record.robot, states.action, states.intrinsics, states.extrinsics, render, rendered, data, first)
+    extrinsics = _move_camera(record, states, data) if record.camera.moves else states.extrinsics
+    size = states.robot_mask.shape[2], states.robot_mask.shape[1]
+    parts = tuple(_part_command(view_episode(folder, part)) for part in record.camera.parts)
+    return Command(record.robot, states.action, states.intrinsics, extrinsics, render, rendered, data, first, size, parts)
+
+
+def _part_command(folder: Path) -> Command:
+    """The command of a view that is part of a tiled picture. Raises EpisodeError if it is tiled itself."""
+    record = read_record(folder)
+    if record.camera.parts:
+        raise EpisodeError(f"{folder} is part of a tiled view and is tiled itself; delete it, or tile other views.")
+    return make_command(folder, record, read_states(folder, record))
+
+
+def _move_camera(record: Record, states: States, data: Path) -> Float[np.ndarray, "t 4 4"]:
+    """World to camera [t 4 4] as the commands move it: what was measured is not known in advance."""
+    from xew.sim_warp.cameras import commanded_camera
+    from xew.sim_warp.robots import recorded_robot
+
+    return commanded_camera(record.camera, recorded_robot(record.robot, data), states).extrinsics
 
 
 def joints(command: Command) -> Float[np.ndarray, "t 16"]:
@@ -227,7 +267,9 @@ def shows_carried(conditions: Iterable[Condition]) -> bool:
 
 def robot_mask(command: Command) -> Video:
     """The robot's silhouette at every frame, white on black: [t h w 3] uint8."""
-    return np.repeat(command.streams.mask[..., None], 3, axis=-1).astype(np.uint8) * 255
+    mask = command.streams.mask
+    rows = mask.reshape(-1, mask.shape[-1]).view(np.uint8) * 255  # all frames below each other, for one call of OpenCV
+    return cv2.cvtColor(rows, cv2.COLOR_GRAY2RGB).reshape(*mask.shape, 3)
 
 
 def optical_flow(command: Command) -> Video:
@@ -241,7 +283,8 @@ def ray_map(command: Command) -> Video:
     """The commanded tool frames, drawn into the image: [t h w 3] uint8."""
     from xew.sim_warp.rendering import streams
 
-    return streams.ray_map(command.robot_spec, command.action, command.camera)
+    parts = command.parts or (command,)
+    return np.concatenate([streams.ray_map(part.robot_spec, part.action, part.camera) for part in parts], axis=1)
 
 
 def reference_image(command: Command) -> Video:
@@ -282,10 +325,18 @@ def tool_poses(command: Command) -> Poses:
 
 
 def camera(command: Command) -> Float[np.ndarray, "t 16"]:
-    """The camera's 16 numbers (`mechanisms.CAMERA`) at every frame: [t 16] float32."""
-    k, rotation, offset = command.intrinsics, command.extrinsics[:3, :3], command.extrinsics[:3, 3]
-    numbers = np.concatenate([[k[0, 0], k[1, 1], k[0, 2], k[1, 2]], rotation.ravel(), -rotation.T @ offset])
-    return np.tile(numbers.astype(np.float32), (len(command.action), 1))
+    """The camera's 16 numbers (`mechanisms.CAMERA`) at every frame, for 320x240 pixels: [t 16] float32."""
+    if command.parts or command.size[0] * CAMERA_SIZE[1] != command.size[1] * CAMERA_SIZE[0]:
+        raise ConfigError("the condition camera is of one picture of 4:3, such as 640x480; {}x{} is not.".format(*command.size))
+    frames = len(command.action)
+    scale = CAMERA_SIZE[0] / command.size[0]
+    k = command.intrinsics * scale
+    k[:2, 2] += (scale - 1) / 2  # (0, 0) is the center of a pixel
+    extrinsics = np.broadcast_to(command.extrinsics, (frames, 4, 4))
+    rotation, offset = extrinsics[:, :3, :3], extrinsics[:, :3, 3]
+    lens = np.tile([k[0, 0], k[1, 1], k[0, 2], k[1, 2]], (frames, 1))
+    position = -np.einsum("tji,tj->ti", rotation, offset)
+    return np.concatenate([lens, rotation.reshape(frames, 9), position], axis=1).astype(np.float32)
 
 
 RELATIVE_SCALE = 20.0

@@ -12,6 +12,7 @@ from typing import TypeVar
 
 from xew.command_line import parse_command
 from xew.config import admit, demand_admitted, load, pick
+from xew.dataset import VIEWS, folder_beside, view_folder
 from xew.model.codecs.codec import RUN_CODEC, codec_class, latent_size
 from xew.model.codecs.contract import CodecSettings, latent_frames
 from xew.model.codecs.vae import VAES
@@ -25,7 +26,7 @@ from xew.model.settings.checks import check_experiment
 from xew.model.settings.parts import ClipInputs, Encoding, EpisodeChoice, TrainSpec, pick_conditions, sample_roles
 from xew.model.settings.settings import AdaptSettings, Clip, ModelSettings, RolloutSettings, TrainSettings
 from xew.model.text.instructions import TEXT_ENCODERS, VOCABULARY, Instructions, TextEncoder, TextSource
-from xew.protocol import ACTION_DIM, SPLITS, Split, expand_robots
+from xew.protocol import ACTION_DIM, HEAD, SPLITS, Split, expand_robots
 
 F = TypeVar("F")
 
@@ -36,6 +37,8 @@ class Experiment:
     """Episodes, made by `python -m xew.sim_warp.generate`."""
     out: Path
     """Folder of the run: config, checkpoints, TensorBoard, samples."""
+    view: str = HEAD
+    """View of the data set: head, or one that `inspect --render --cameras` has added, such as wrist_left."""
     split: str = "fixed"
     """One of protocol.SPLITS, which gives the training robots."""
     clip: Clip = field(default_factory=Clip)
@@ -51,7 +54,13 @@ class Experiment:
     @property
     def cache_folder(self) -> Path:
         data = self.data.resolve() if self.data.name in ("", "..") else self.data
-        return self.cache or data.with_name(f"{data.name}-latents")
+        folder = self.cache or folder_beside(data, "latents")
+        return folder if self.view == HEAD else folder / VIEWS / self.view
+
+    @property
+    def episodes(self) -> Path:
+        """The data set of the view. Raises EpisodeError if the data do not have it."""
+        return view_folder(self.data, self.view)
 
     @property
     def robots(self) -> Split:

@@ -77,7 +77,7 @@ def encode_experiment(experiment: Experiment, source: PixelSource = stored_pixel
     Several processes need a picklable source.
     """
     check_lpips()
-    encoding, choice, dataset = experiment.encoding, experiment.choice, read_dataset(experiment.data)
+    encoding, choice, dataset = experiment.encoding, experiment.choice, read_dataset(experiment.episodes)
     if experiment.cache is None and encoding.folder.is_symlink():
         raise ConfigError(f"{encoding.folder} is a link; name the folder that it leads to: --cache {encoding.folder.resolve()}")
     episodes = training_episodes(dataset, choice)

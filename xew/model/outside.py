@@ -10,7 +10,7 @@ Command: python -m xew.model.outside module:NAME --data DATA --split test --out 
 """
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal, Protocol
@@ -20,13 +20,14 @@ import tyro
 from tqdm import tqdm
 
 from xew.config import ConfigError, admit, import_named, user_errors
-from xew.dataset import Episode
-from xew.episode import read_pixels, remove_left_overs
+from xew.dataset import Episode, view_episode, view_folder
+from xew.episode import read_pixels, read_record, remove_left_overs
 from xew.files import hold_lock
 from xew.model.episodes.choice import select_episodes
 from xew.model.episodes.commands import episode_command
-from xew.model.rollout import RolloutWriter, check_out, common_header, is_done
-from xew.protocol import LEFT_GRIPPER, RIGHT_GRIPPER
+from xew.model.rollout import check_out, common_header, is_done
+from xew.model.sampling.writing import RolloutWriter
+from xew.protocol import HEAD, LEFT_GRIPPER, RIGHT_GRIPPER
 
 
 @dataclass(frozen=True)
@@ -45,19 +46,22 @@ class EpisodeInputs:
     frame_count: int
     """Number of frames to predict, including the first."""
     first_frame: np.ndarray
-    """Picture of the head camera, uint8 [240 320 3]."""
+    """Picture of the camera, uint8 [h w 3]; [240 320 3] of the head camera."""
     joints: np.ndarray
     """Commanded joints [rad] and grippers [0 closed, 1 open], float32 [t 16] (`xew.protocol`)."""
     tool_poses: np.ndarray
     """Commanded world poses of the left and right tool, float64 [t 2 7]: x y z [m] and quaternion x y z w."""
     intrinsics: np.ndarray
-    """Matrix K of the camera, float64 [3 3] [pixels of 320x240]."""
+    """Matrix K of the camera, float64 [3 3] [pixels]."""
     extrinsics: np.ndarray
-    """Matrix from the world to the camera (x right, y down, z forward), float64 [4 4]."""
+    """Matrix from the world to the camera (x right, y down, z forward), float64 [4 4], or [t 4 4] of a camera that the
+    commands move."""
     robot_render: np.ndarray
-    """Robot alone on white, posed by the commands: uint8 [t 240 320 3]."""
+    """Robot alone on white, posed by the commands: uint8 [t h w 3]."""
     streams: tuple[np.ndarray, np.ndarray] | None = None
     """Mask and optical flow of that robot, for models with `needs_streams` (`OutsideModel`)."""
+    views: Mapping[str, "EpisodeInputs"] | None = None
+    """The same of the views that a model with `views` asks for, by name (`OutsideModel`)."""
 
     @property
     def grippers(self) -> np.ndarray:
@@ -66,12 +70,12 @@ class EpisodeInputs:
 
     @property
     def robot_mask(self) -> np.ndarray:
-        """Mask of that robot, bool [t 240 320]. Raises ConfigError unless the model has `needs_streams`."""
+        """Mask of that robot, bool [t h w]. Raises ConfigError unless the model has `needs_streams`."""
         return self._stream(0)
 
     @property
     def optical_flow(self) -> np.ndarray:
-        """That robot's exact motion to the next frame [pixels], float32 [t 240 320 2]. Raises ConfigError as `robot_mask`."""
+        """That robot's exact motion to the next frame [pixels], float32 [t h w 2]. Raises ConfigError as `robot_mask`."""
         return self._stream(1)
 
     def _stream(self, number: int) -> np.ndarray:
@@ -83,10 +87,11 @@ class EpisodeInputs:
 
 
 class OutsideModel(Protocol):
-    """A custom model. With the attribute `needs_streams = True` its inputs include mask and flow."""
+    """A custom model. With the attribute `needs_streams = True` its inputs include mask and flow; with `views = ("head",
+    "wrist_left")`, the inputs of these views. It predicts the view of --view."""
 
     def __call__(self, inputs: EpisodeInputs) -> np.ndarray:
-        """Video uint8 [t h w 3] with t = inputs.frame_count, including the first frame; any h and w of 4:3."""
+        """Video uint8 [t h w 3] with t = inputs.frame_count, including the first frame; any h and w of the camera's ratio."""
 
 
 def load_model(name: str) -> OutsideModel:
@@ -103,8 +108,8 @@ def load_model(name: str) -> OutsideModel:
     return model
 
 
-def read_inputs(episode: Episode, max_frames: int = 0, streams: bool = False) -> EpisodeInputs:
-    """Inputs of an episode or of its first `max_frames` frames; `streams` need Warp."""
+def read_inputs(episode: Episode, max_frames: int = 0, streams: bool = False, views: Sequence[str] = ()) -> EpisodeInputs:
+    """Inputs of an episode or of its first `max_frames` frames, also of other views; `streams` need Warp."""
     folder, record = episode
     frames = min(record.frame_count, max_frames) if max_frames else record.frame_count
     command = episode_command(folder, record)
@@ -123,7 +128,14 @@ def read_inputs(episode: Episode, max_frames: int = 0, streams: bool = False) ->
         extrinsics=np.array(command.extrinsics),
         robot_render=np.array(command.render[:frames]),
         streams=(np.array(command.streams.mask[:frames]), np.array(command.streams.optical_flow[:frames])) if streams else None,
+        views={view: read_inputs(find_view(folder, view), max_frames, streams) for view in views} if views else None,
     )
+
+
+def find_view(folder: Path, view: str) -> Episode:
+    """An episode in a view of its data set. Raises EpisodeError if the view does not have it."""
+    seen = view_episode(folder, view)
+    return seen, read_record(seen)
 
 
 def predict(model: OutsideModel, name: str, inputs: EpisodeInputs) -> np.ndarray:
@@ -157,6 +169,8 @@ class Args:
     """Folder to write to (default: rollouts/NAME)."""
     trust: tuple[str, ...] = ()
     """Modules of custom tasks and robots, such as my_lab.tasks, that the data may name."""
+    view: str = HEAD
+    """View of the data set that the model predicts."""
 
 
 @user_errors
@@ -169,11 +183,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     name = args.model.rpartition(":")[2]
     out = args.out or Path("rollouts") / name
     check_out(out, args.data)
-    episodes = select_episodes(args.data, args.split, args.robots or None)
+    episodes = select_episodes(view_folder(args.data, args.view), args.split, args.robots or None)
     items = [(e, common_header(name, args.condition, e[1], args.max_frames) | {"outside": args.model}) for e in episodes]
     pending = [item for item in items if not is_done(out, *item)]
     model = load_model(args.model)
-    streams = bool(getattr(model, "needs_streams", False))
+    streams, views = bool(getattr(model, "needs_streams", False)), tuple(getattr(model, "views", ()))
     with (
         hold_lock(out),
         tqdm(total=len(pending), desc="rollout", unit="episode", file=sys.stderr) as progress,
@@ -181,7 +195,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     ):
         remove_left_overs(out)
         for episode, header in pending:
-            writer.write(episode[1], predict(model, args.model, read_inputs(episode, args.max_frames, streams)), header)
+            inputs = read_inputs(episode, args.max_frames, streams, views)
+            writer.write(episode[1], predict(model, args.model, inputs), header)
     print(f"{out}: {len(pending)} rollouts new, {len(items) - len(pending)} there before, {args.model}")
 
 

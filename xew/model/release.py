@@ -17,7 +17,7 @@ import tyro
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from xew.config import ConfigError, admit, user_errors
-from xew.dataset import read_dataset
+from xew.dataset import read_dataset, view_folder
 from xew.episode import Record
 from xew.files import hold_lock, read_text, write_text
 from xew.model.cache.scales import load_run_scales
@@ -46,7 +46,7 @@ def release(run: Path, out: Path, data: Path | None = None, scores: Path | None 
         experiment = replace(experiment, out=run)
     if scores and not scores.is_file():
         raise ConfigError(f"--scores {scores} is not a file; expected scores.summary.md of `python -m xew.metrics.evaluate`.")
-    episodes = training_episodes(read_dataset(data or experiment.data), experiment.choice)
+    episodes = training_episodes(read_dataset(view_folder(data or experiment.data, experiment.view)), experiment.choice)
     data_counts = count_by_task(record for _, record in episodes)
     summary = read_text(scores) if scores else ""
     params, step = load_params(run, experiment.network, step)

@@ -1,88 +1,35 @@
 """Rollouts: predict episodes with a trained model from their first frame and their commands.
 
 Reads  a run, or a config that names published weights; episodes
-Writes <out>/<task>/<seed>/<robot>/rgb.mkv (lossless, 320x240) and rollout.json
+Writes <out>/<task>/<seed>/<robot>/rgb.mkv (lossless, at the camera's size) and rollout.json
 
-Episodes are predicted in batches over all devices, in parallel with reading the next two batches and writing the previous one.
+Rollouts of a tiled view are also cut into <out>-views/<view>/, one tree for each of its views.
+Each GPU has a process, which predicts batches of episodes, reads the next two batches and writes the previous one at a time.
 Command: python -m xew.model.rollout RUN --data DATA --split test [--robots … --out … --rollout.steps …]
 """
 
+import functools
 import itertools
 import sys
-from collections import deque
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Literal
 
-import jax
-import numpy as np
-from jax.sharding import Mesh
-from tqdm import tqdm
-
 from xew.command_line import find_path, parse_command
-from xew.compilation import keep_compiled_programs
-from xew.concurrency import map_in_order, usable_cores
-from xew.config import CONVERTER, ConfigError, admit, find_config, is_packaged, user_errors
-from xew.dataset import Episode
-from xew.episode import Record, episode_folder, remove_left_overs
+from xew.compilation import take_memory_as_needed
+from xew.config import CONVERTER, ConfigError, admit, find_config, user_errors
+from xew.dataset import Episode, view_episode, view_folder
+from xew.episode import Record, episode_folder, read_record, remove_left_overs
 from xew.files import hold_lock, read_json
-from xew.model.cache.scales import Scale, load_run_scales
-from xew.model.cache.store import load_codec
-from xew.model.codecs.contract import Codec
-from xew.model.devices.sharding import MeshSettings, make_mesh, replicated_sharding
 from xew.model.episodes.choice import select_episodes
 from xew.model.experiment import Experiment, parse_experiment
-from xew.model.network.dit import cast_params, network_graph
-from xew.model.network.dit_layouts import load_dit_params
-from xew.model.runs.checkpoint import load_params
-from xew.model.runs.folder import load_run_codec, load_run_config
-from xew.model.runs.layout import checkpoint_time
-from xew.model.sampling.predict import Prediction, Predictor, make_predictor
+from xew.model.loading import is_config, open_predictor
+from xew.model.runs.folder import load_run_config
+from xew.model.runs.layout import checkpoint_time, list_steps
+from xew.model.sampling.rolling import roll_out
 from xew.model.settings.checks import check_experiment
 from xew.model.settings.settings import RolloutSettings
-from xew.model.training.step import make_trainer
-from xew.model.video.frames import to_camera_size
-from xew.rollout import write_rollout
-
-Item = tuple[Episode, dict[str, Any]]
-"""An episode to predict and the header of its rollout."""
-WRITERS = min(8, usable_cores())
-"""Number of threads that compress videos."""
-WAITING = 16
-"""Largest number of videos that wait for a writer."""
-
-
-def load_predictor(run: Path, experiment: Experiment, step: int | None = None) -> tuple[Predictor, int | None]:
-    """Load a run's model on each device, with the step of its checkpoint, or a config's published weights with step None.
-
-    Args:
-        run: folder of the run, or the config.
-        experiment: its config, perhaps with other sampling settings.
-        step: of the checkpoint, by default the latest.
-
-    Raises:
-        ConfigError: there is no such checkpoint, or there are no such weights.
-    """
-    if is_config(run):
-        return load_published(experiment, run), None
-    mesh, codec = make_mesh(MeshSettings()), load_run_codec(run, experiment.codec)
-    params, step = load_params(run, experiment.network, step, replicated_sharding(mesh))
-    scales = load_run_scales(experiment.conditions, run)
-    return _place_predictor(experiment, codec, params, mesh, scales), step
-
-
-def _place_predictor(experiment: Experiment, codec: Codec, params: Any, mesh: Mesh, scales: Mapping[str, Scale]) -> Predictor:
-    """The predictor with parameters in the types of their products, and a copy of the codec on each device."""
-    params = jax.jit(cast_params, static_argnums=0)(network_graph(experiment.network.for_sampling), params)
-    return make_predictor(experiment, jax.device_put(codec, replicated_sharding(mesh)), params, scales)
-
-
-def is_config(run: Path) -> bool:
-    """Whether a path is a config with published weights, not the folder of a run."""
-    return run.suffix in (".yaml", ".yml") or is_packaged(run)
 
 
 def default_name(run: Path) -> str:
@@ -91,21 +38,11 @@ def default_name(run: Path) -> str:
     return run.stem if is_config(run) else run.name
 
 
-def load_published(experiment: Experiment, source: Path) -> Predictor:
-    """A config's network with its published weights.
-
-    Raises:
-        ConfigError: the config names no weights, or needs scales of training episodes.
-    """
-    if experiment.model.weights is None:
-        raise ConfigError(f"{source} names no model.weights; set it to published weights, or give the folder of a run.")
-    scaled = [condition.name for condition in experiment.conditions.values() if condition.scale != "none"]
-    if scaled:
-        raise ConfigError(f"{source}: {', '.join(scaled)} is scaled by training episodes; train a run and roll that out.")
-    mesh = make_mesh(MeshSettings())
-    graph, params = make_trainer(experiment.spec, mesh).random_network()
-    params = load_dit_params(graph, params, experiment.model.weights)
-    return _place_predictor(experiment, load_codec(experiment.encoding), params, mesh, {})
+def find_step(run: Path, checkpoint: int | None) -> int | None:
+    """The step of a run's checkpoint, by default the latest; None for published weights, or without checkpoints."""
+    if is_config(run):
+        return None
+    return max(list_steps(run), default=None) if checkpoint is None else checkpoint
 
 
 def check_out(out: Path, data: Path) -> None:
@@ -119,7 +56,7 @@ def rollout_header(experiment: Experiment, step: int | None, saved: int | None, 
 
     `step` and `saved` (`checkpoint_time`) identify the checkpoint; they are None for published weights.
     """
-    _, record = episode
+    folder, record = episode
     action, embodiment = experiment.model.action, experiment.model.embodiment
     header = common_header(
         experiment.out.name,
@@ -128,6 +65,8 @@ def rollout_header(experiment: Experiment, step: int | None, saved: int | None, 
         experiment.rollout.max_frames,
     )
     config = CONVERTER.unstructure(replace(experiment, rollout=replace(experiment.rollout, batch=0)))
+    if record.camera.parts:
+        header["views"] = {part: read_record(view_episode(folder, part)).hashes["rgb"] for part in record.camera.parts}
     return header | {"checkpoint_step": step, "checkpoint_saved": saved, "config": config}
 
 
@@ -145,68 +84,6 @@ def is_done(out: Path, episode: Episode, header: dict[str, Any]) -> bool:
         return read_json(folder / "rollout.json") == header and (folder / "rgb.mkv").exists()
     except (OSError, ValueError):
         return False
-
-
-class RolloutWriter:
-    """Writes rollouts in threads; the end of its `with` block waits for all. A failed write is raised by a later call.
-
-    Args:
-        out: root of the rollout tree.
-        done: called in the caller's thread after each written rollout.
-        resize: function applied to each video before writing, or None.
-    """
-
-    def __init__(
-        self, out: Path, done: Callable[[], Any], resize: Callable[[np.ndarray], np.ndarray] | None = to_camera_size
-    ) -> None:
-        self.out, self.done, self.resize = out, done, resize
-        self.threads = ThreadPoolExecutor(WRITERS)
-        self.waiting: deque[Future[Path]] = deque()
-
-    def write(self, record: Record, video: np.ndarray, header: dict[str, Any]) -> None:
-        """Queue a video uint8 [t h w 3]."""
-        self.waiting.append(self.threads.submit(self._write, record, video, header))
-        while len(self.waiting) > WAITING or (self.waiting and self.waiting[0].done()):
-            self._settle()
-
-    def _write(self, record: Record, video: np.ndarray, header: dict[str, Any]) -> Path:
-        resized = video if self.resize is None else self.resize(video)
-        return write_rollout(self.out, record.task, record.seed, record.robot, resized, header, record.frame_rate)
-
-    def _settle(self) -> None:
-        self.waiting.popleft().result()
-        self.done()
-
-    def __enter__(self) -> "RolloutWriter":
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        """Write all queued videos, also after an error in the block."""
-        self.threads.shutdown(wait=True)
-        while kind is None and self.waiting:
-            self._settle()
-
-
-def predict_and_write(predictor: Predictor, pending: Sequence[Item], writer: RolloutWriter) -> None:
-    """Roll out episodes in batches of similar length, and write them; threads read two batches ahead of the devices."""
-    size = max(min(predictor.settings.batch, len(pending)), 1)
-    ordered = sorted(pending, key=lambda item: item[1]["frame_count"])
-    read = map_in_order(predictor.read, [episode for episode, _ in ordered], min(size, usable_cores()))
-    started: deque[tuple[list[Item], Prediction]] = deque()
-
-    def write_oldest() -> None:
-        items, prediction = started.popleft()
-        for ((_, record), header), video in zip(items, prediction.fetch(), strict=True):
-            writer.write(record, video[: header["frame_count"]], header)
-
-    for start in range(0, len(ordered), size):
-        items = ordered[start : start + size]
-        inputs = list(itertools.islice(read, len(items)))
-        started.append((items, predictor.begin(inputs, items[-1][1]["frame_count"], size)))
-        if len(started) > 1:
-            write_oldest()
-    while started:
-        write_oldest()
 
 
 @dataclass(frozen=True)
@@ -238,22 +115,19 @@ class RunChoices:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Predict episodes and write them."""
     run, flags, experiment = parse_rollout(arguments)
-    keep_compiled_programs()
-    predictor, step = load_predictor(run, experiment, flags.checkpoint)
+    take_memory_as_needed()
     data, out = flags.data or experiment.data, flags.out or Path("rollouts") / default_name(run)
     check_out(out, data)
-    episodes = select_episodes(data, flags.split, flags.robots or None)
+    episodes = select_episodes(view_folder(data, experiment.view), flags.split, flags.robots or None)
+    step = find_step(run, flags.checkpoint)
     saved = None if step is None else checkpoint_time(run, step)
     headers = [(episode, rollout_header(experiment, step, saved, episode)) for episode in episodes]
     pending = [item for item in headers if not is_done(out, *item)]
-    experiment.instructions.encode([record.instruction for (_, record), _ in pending])  # all at once, where that costs
-    with (
-        hold_lock(out),
-        tqdm(total=len(pending), desc="rollout", unit="episode", file=sys.stderr) as progress,
-        RolloutWriter(out, progress.update) as writer,
-    ):
+    with hold_lock(out):
         remove_left_overs(out)
-        predict_and_write(predictor, pending, writer)
+        if pending:
+            experiment.instructions.encode([record.instruction for (_, record), _ in pending])  # at once, where that costs
+            roll_out(functools.partial(open_predictor, run, experiment, step), pending, out)
     source = "published weights" if step is None else f"checkpoint {step}"
     print(f"{out}: {len(pending)} rollouts new, {len(headers) - len(pending)} there before, {source}")
 

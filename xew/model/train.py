@@ -104,7 +104,7 @@ def train(experiment: Experiment, *, resume: bool = False, overwrite: bool = Fal
     check_batch(experiment.train.batch, experiment.train.accumulate, mesh.size)
     own = process_samples(mesh, experiment.train.batch)
     check_start(experiment)
-    episodes = choose_episodes(read_dataset(experiment.data), experiment.choice)
+    episodes = choose_episodes(read_dataset(experiment.episodes), experiment.choice)
     source = ClipSource.open(experiment.encoding, experiment.instructions, episodes.fresh, episodes.replay)
     source.check()
     spec = experiment.spec.with_steps(source.fresh)

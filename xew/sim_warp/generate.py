@@ -22,11 +22,22 @@ import tyro
 from tqdm import tqdm
 
 from xew.config import user_errors
-from xew.dataset import find_records
+from xew.dataset import find_records, read_dataset
 from xew.episode import EpisodeError, Record, remove_left_overs
 from xew.files import hold_lock
-from xew.protocol import SEED_STARTS, TEST_SEEDS_PER_TASK, TRAIN_SEEDS_PER_TASK, expand_robots, seed_split
+from xew.protocol import (
+    HEAD,
+    SEED_STARTS,
+    TEST_SEEDS_PER_TASK,
+    TRAIN_SEEDS_PER_TASK,
+    expand_robots,
+    seed_split,
+    split_key,
+)
+from xew.sim_warp.cameras import demand_sight, get_views
+from xew.sim_warp.changes.scenes import check_change, demand_change
 from xew.sim_warp.devices.workers import Workers, find_device, find_devices, quiet_warp, worker_count
+from xew.sim_warp.inspection.checks import render_views
 from xew.sim_warp.manifest import PACKAGED, Manifest, read_manifest
 from xew.sim_warp.production.cells import Job
 from xew.sim_warp.production.produce import Production, make_scenes
@@ -58,7 +69,11 @@ class Args:
     """Number of accepted seeds per task of the block reserved for the final study."""
     test_robots: tuple[str, ...] = ()
     """Robots of the test seeds; default: --robots."""
-    out: Path = Path("data")
+    change: str = ""
+    """One change of all scenes, as FACTOR:LEVEL: light, background, table, clutter, height or camera, with levels 1, 2, 3 of
+    growing strength (docs/cameras.md). random: a change is drawn for each scene, for training."""
+    out: Path | None = None
+    """Folder of the data set; default: data, with a change such as light:2 data_light_2."""
     batch: int = 256
     """Number of worlds that a GPU steps together. On a CPU each worker steps one world at a time."""
     workers: int | None = None
@@ -75,10 +90,20 @@ class Args:
     between the task's waypoints on its own path, in its own time and from its own rest posture."""
     states_only: bool = False
     """Store states and all hashes without videos; `python -m xew.sim_warp.inspect DATA --render` makes videos on demand."""
+    cameras: tuple[str, ...] = (HEAD,)
+    """Cameras with a view of each accepted episode: head, wrist_left, wrist_right, front, side, or YAML files
+    (docs/cameras.md). The head camera at 320x240 is always there."""
+    size: str | None = None
+    """Size of these views, such as 640x480; default: the camera's."""
     manifest: Path = PACKAGED
     """File with the seeds that are known to fail."""
     search: bool = False
     """Try every seed, ignoring the manifest."""
+
+    @property
+    def folder(self) -> Path:
+        """Folder of the data set."""
+        return self.out or Path(split_key("data", self.motion, self.change))
 
 
 @contextmanager
@@ -86,7 +111,7 @@ def start_workers(args: Args, robots: Mapping[str, RobotSpec]) -> Iterator[Calla
     """Start worker processes with compiled kernels; yields the function that makes the scenes of jobs."""
     devices = find_devices(args.device)
     physics = find_device(args.physics) if args.physics else devices[0]
-    production = Production(args.out, robots, physics.is_cuda, args.batch, not args.states_only)
+    production = Production(args.folder, robots, physics.is_cuda, args.batch, not args.states_only)
     with Workers(args.workers or worker_count(devices, physics), devices) as workers:
         parts = {"physics": physics.alias, "kinematics": physics.alias, "rendering": devices[0].alias}
         compile_on_devices(workers, parts, args.batch)
@@ -96,8 +121,8 @@ def start_workers(args: Args, robots: Mapping[str, RobotSpec]) -> Iterator[Calla
 def generate(args: Args) -> list[Family]:
     """Make missing episodes; returns all families with their records."""
     _check(args)
-    robots = _find_robots(args.robots, args.out)
-    tested = _find_robots(args.test_robots, args.out) or robots
+    robots = _find_robots(args.robots, args.folder)
+    tested = _find_robots(args.test_robots, args.folder) or robots
     manifest = Manifest() if args.search else read_manifest(args.manifest)
     teams = dict.fromkeys(SEED_STARTS, tuple(robots)) | dict.fromkeys(("test", "final"), tuple(tested))
     families = plan_seeds(args, teams, manifest)
@@ -128,11 +153,12 @@ def plan_seeds(args: Args, robots: Mapping[str, Sequence[str]], manifest: Manife
         "test": args.test_seeds,
         "final": args.final_seeds,
     }
-    return plan_families(args.tasks, wanted, robots, manifest, motion=args.motion, unpaired=args.unpaired)
+    return plan_families(args.tasks, wanted, robots, manifest, motion=args.motion, change=args.change, unpaired=args.unpaired)
 
 
 def _check(args: Args) -> None:
-    """Check tasks and numbers before any work. Raises ConfigError or EpisodeError."""
+    """Check tasks, the change and numbers before any work. Raises ConfigError or EpisodeError."""
+    check_change(args.change)
     for task in args.tasks:
         get_task(task)
     if args.workers is not None and args.workers < 1:
@@ -177,9 +203,9 @@ def _read_existing(families: list[Family], args: Args) -> None:
 
     Raises:
         EpisodeError: a header is damaged or in a wrong folder, an episode of these tasks was imported, or the data set has
-            no videos or another kind of motion.
+            no videos, another kind of motion or another change.
     """
-    out = args.out
+    out = args.folder
     for folder, record in find_records(out):
         if not record.videos and not args.states_only:
             raise EpisodeError(
@@ -190,6 +216,7 @@ def _read_existing(families: list[Family], args: Args) -> None:
             raise EpisodeError(
                 f"{out} holds episodes of {record.motion} motion, expected {args.motion} motion; choose another --out."
             )
+        demand_change(folder, record, args.change)
         for family in families:
             if args.unpaired and record.robot not in family.robots:
                 continue
@@ -215,8 +242,15 @@ def main() -> None:
     quiet_warp()
     args = tyro.cli(Args, description=__doc__)
     print(f"device: {', '.join(device.name for device in find_devices(args.device))}")
-    with hold_lock(args.out):
+    views = get_views(args.cameras, args.size)
+    if views and args.states_only:
+        raise EpisodeError("--cameras makes videos, and --states-only stores none; add views by inspect --render --cameras.")
+    if views:
+        demand_sight(views, [get_robot(name, args.folder) for name in expand_robots(args.robots)])
+    with hold_lock(args.folder):
         families = generate(args)
+        if views:
+            render_views(read_dataset(args.folder).accepted, views)
     print(yield_table([record for family in families for seed in family.done.values() for record in seed.values()]))
     demand_enough(families)
 

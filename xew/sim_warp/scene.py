@@ -94,6 +94,10 @@ class Scene:
     """Words of this scene (colors, sizes) for the slots of the instruction."""
     targets: dict[str, tuple[float, float]] = field(default_factory=dict)
     """Target places without objects, such as of a row of blocks: x y [m]."""
+    clutter: tuple[SceneObject, ...] = ()
+    """Fixed objects that no robot and no object touches: they are rendered, not simulated."""
+    raised: float = 0.0
+    """Height of the table's top, and of all objects, over the standard one [m]."""
 
     def index(self, name: str) -> int:
         """The number of an object. Raises ConfigError if the scene has none of that name."""
@@ -122,7 +126,9 @@ def scene_rng(task: str, seed: int) -> np.random.Generator:
 def scene_hash(scene: Scene) -> str:
     """SHA-256 over the content of a scene."""
     digest = hashlib.sha256(repr((scene.task, scene.seed, sorted(scene.words.items()), sorted(scene.targets.items()))).encode())
-    for thing in scene.objects:
+    if scene.raised:
+        digest.update(repr(scene.raised).encode())
+    for thing in (*scene.objects, *scene.clutter):
         digest.update(repr(_plain_numbers(thing)).encode())
         for shape in (thing.shape, *((thing.hinge.lid,) if thing.hinge else ())):
             mesh = shape.mesh

@@ -45,6 +45,8 @@ class Light:
     """Direction in which it shines; for a point light the axis of its shadow map."""
     position: tuple[float, float, float] | None = None
     """Position in the world frame [m]; None makes the light directional."""
+    color: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """Linear RGB."""
 
 
 LIGHTS = (
@@ -64,18 +66,53 @@ SHADOW_ANGLE = 80.0
 """Full angle of a point light's shadow map [deg]."""
 
 
-def stage_mesh() -> Mesh:
-    """Table, wall and ground as one mesh in the world frame."""
-    leg_height = TABLE_TOP - TABLE_SIZE[2]
+@dataclass(frozen=True, eq=False)
+class Pattern:
+    """A periodic image on the horizontal or vertical faces of one part of the stage."""
+
+    image: np.ndarray
+    """[p p 3] uint8, sRGB; its columns run along x, or along y on faces that face x."""
+    period: float
+    """Side of the image on the surface [m]."""
+
+
+@dataclass(frozen=True)
+class Stage:
+    """Lights and surfaces round the objects, as the renderer shows them."""
+
+    lights: tuple[Light, ...] = LIGHTS
+    ambient: float = AMBIENT
+    """As `AMBIENT`."""
+    raised: float = 0.0
+    """Height of the table's top over the standard one [m]."""
+    table: Pattern | None = None
+    wall: Pattern | None = None
+    ground: Pattern | None = None
+    """Patterns of the surfaces; None shows their plain colors."""
+
+
+STANDARD = Stage()
+"""The stage of all unchanged scenes."""
+
+
+def stage_parts(stage: Stage = STANDARD) -> list[tuple[Mesh, Pattern | None]]:
+    """Table, wall, ground and legs in the world frame, each with its pattern."""
+    top = TABLE_TOP + stage.raised
+    leg_height = top - TABLE_SIZE[2]
     legs = [
         box((LEG_SIZE, LEG_SIZE, leg_height), TABLE_COLOR).transformed((x * LEG_XY[0], y * LEG_XY[1], leg_height / 2))
         for x in (-1, 1)
         for y in (-1, 1)
     ]
-    plate = box(TABLE_SIZE, TABLE_COLOR).transformed((0, 0, TABLE_TOP - TABLE_SIZE[2] / 2))
+    plate = box(TABLE_SIZE, TABLE_COLOR).transformed((0, 0, top - TABLE_SIZE[2] / 2))
     wall = box(WALL_SIZE, WALL_COLOR).transformed(WALL_CENTER)
     ground = box((GROUND_SIZE, GROUND_SIZE, 0.1), GROUND_COLOR).transformed((0, 0, -0.05))
-    return merge([plate, wall, ground, *legs])
+    return [(plate, stage.table), (wall, stage.wall), (ground, stage.ground), *((leg, stage.table) for leg in legs)]
+
+
+def stage_mesh(stage: Stage = STANDARD) -> Mesh:
+    """Table, wall and ground as one mesh in the world frame."""
+    return merge([mesh for mesh, _ in stage_parts(stage)])
 
 
 def linear_from_srgb(color: np.ndarray) -> np.ndarray:

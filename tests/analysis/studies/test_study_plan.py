@@ -26,7 +26,7 @@ from xew.analysis.studies.plan import Step, plan, sort_steps, source_digest, ste
 from xew.analysis.study import main
 from xew.analysis.study_analyse import format_coverage
 from xew.config import ConfigError, merge_settings
-from xew.protocol import PAPER_PARTS, PARTS, VARIANTS, expand_robots
+from xew.protocol import PAPER_PARTS, PARTS, SEEN_ROBOTS, VARIANTS, expand_robots
 
 CONFIGS = Path(__file__).parents[3] / "configs"
 DEBUG = CONFIGS / "study_debug.yaml"
@@ -173,6 +173,30 @@ def test_the_report_is_made_anew_when_the_study_in_the_other_motion_has_scores(s
     assert before == plan(study)["analyse"].inputs, "nothing to compare with yet"
     (tmp_path / "scores.parquet").write_bytes(b"scores")
     assert plan(beside)["analyse"].inputs != before and beside.other_scores == tmp_path / "scores.parquet"
+
+
+def test_changed_scenes_are_made_predicted_and_graded_for_one_model() -> None:
+    study = load_study(CONFIGS / "study_shifts.yaml", ["--training-seeds", "0", "1"])
+    steps = plan(study)
+    name = PARTS["shifts"][0].name
+    assert len(study.shifted_runs) == 18 and len(steps) == 3 + 4 * 2 + 3 * 18, "of the first training alone"
+    lamp, table = (steps[f"generate/{name}@{change}"].command for change in ("light_2", "height_3"))
+    assert lamp[0] == "xew.sim_warp.inspect" and lamp[-4:] == ("--change", "light:2", "--out", "studies/shifts/data_light_2")
+    assert table[0] == "xew.sim_warp.generate" and table[12:16] == ("--train-seeds", "0", "--test-seeds", "6")
+    rollout, grading = steps[f"rollout/{name}@light_2"], steps[f"evaluate/{name}@light_2"]
+    assert rollout.needs == (f"generate/{name}@light_2", f"train/{name}") and grading.name in steps["analyse"].needs
+    robots = rollout.command[rollout.command.index("--robots") + 1 : rollout.command.index("--out")]
+    assert (
+        robots == SEEN_ROBOTS
+        and "studies/shifts/data_light_2" in rollout.command
+        and "studies/shifts/data" not in rollout.command
+    )
+    assert str(study.scores_path(f"{name}@light_2")) in grading.command
+    assert estimate(study, steps)[f"rollout/{name}@light_2"].amount == 6 * 6 * 3
+    few = load_study(CONFIGS / "study_shifts.yaml", ["--changes", "clutter:1"])
+    assert list(few.shifted_runs) == [f"{name}@clutter_1"] and not load_study(DEBUG).shifted_runs
+    with pytest.raises(ConfigError, match="unknown change of scenes 'light:4'"):
+        load_study(CONFIGS / "study_shifts.yaml", ["--changes", "light:4"])
 
 
 def test_every_training_seed_is_a_training_of_every_variant(study: Study) -> None:

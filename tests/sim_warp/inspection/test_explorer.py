@@ -1,6 +1,7 @@
 """What the explorer writes: films, overlays, the choice of scenes, and the page's files; test_explorer_page.py plays them."""
 
 import json
+import shutil
 import sys
 from dataclasses import fields, replace
 from pathlib import Path
@@ -9,8 +10,10 @@ import av
 import numpy as np
 import pytest
 
-from tests.synthetic import write_synthetic_data
+from tests.synthetic import write_synthetic_data, write_synthetic_view
+from xew.dataset import find_accepted, view_episode
 from xew.episode import EpisodeError, Record, States, read_record, read_states, read_video
+from xew.protocol import CameraSpec
 from xew.rollout import write_rollout
 from xew.sim_warp.inspect import main
 from xew.sim_warp.inspection.explorer import Page, choose_scenes, find_predictions, write_page
@@ -165,6 +168,19 @@ def test_the_command_writes_a_page(
     assert frames.shape == (FRAMES, 720, 640, 3) and np.abs(frames[:, :240, 320:].astype(int) - truth).mean() < 4
 
 
+def test_other_views_are_rows_of_the_film(data: Path, tmp_path: Path) -> None:
+    """They have the size of the first row, and white where their aspect ratio leaves some."""
+    copy = Path(shutil.copytree(data, tmp_path / "data"))
+    write_synthetic_view(copy, CameraSpec("shelf", size=(160, 80)))
+    scenes, _ = choose_scenes(find_accepted(copy), (), 6, {})
+    write_page(Page("t", scenes, 0, {}, flow=False, views=("head", "shelf_160x80")), tmp_path / "page")
+    (film,) = read_script(next((tmp_path / "page" / "scenes").glob("*.js")))["films"]
+    assert film["rows"] == ["video", "shelf_160x80"] and film["tile"] == [320, 240]
+    frames = read_video(next((tmp_path / "page" / "scenes").glob("*.mp4")))
+    seen = read_video(view_episode(scenes[0].cells[0][0], "shelf_160x80") / "rgb.mkv")
+    assert np.abs(frames[:, 240:400:2, 0:320:2].astype(int) - seen).mean() < 8 and frames[:, 405:, :].min() > 240
+
+
 def test_flow_is_a_row_of_the_film(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     flow = np.zeros((FRAMES, 240, 320, 2), np.float32)
     flow[:, 100:200, 100:200] = [25, 0]
@@ -173,7 +189,7 @@ def test_flow_is_a_row_of_the_film(data: Path, tmp_path: Path, monkeypatch: pyte
     class Streams:
         optical_flow = flow
 
-    monkeypatch.setattr(streams, "command_streams", lambda robot, action: asked.append(robot.key) or Streams)
+    monkeypatch.setattr(streams, "command_streams", lambda robot, action, camera: asked.append(robot.key) or Streams)
     cells = [(path.parent, read_record(path.parent)) for path in sorted(data.rglob("episode.json"))]
     write_page(Page("t", choose_scenes(cells, (), 6, {})[0], 0, {}), tmp_path / "page")
     assert asked == ["ur5_wsg", "piper"]

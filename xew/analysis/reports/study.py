@@ -7,7 +7,17 @@ from pathlib import Path
 import pandas as pd
 from markupsafe import Markup
 
-from xew.analysis.beyond import Motions, difficulty_table, find_difficulty, find_gaps, gaps_table, motion_table, scaling_table
+from xew.analysis.beyond import (
+    Motions,
+    Shifts,
+    difficulty_table,
+    find_difficulty,
+    find_gaps,
+    gaps_table,
+    motion_table,
+    scaling_table,
+    shifts_table,
+)
 from xew.analysis.paper import AXES, read_paper
 from xew.analysis.reports import page
 from xew.analysis.reports.answer import Answer, answer, answer_strip, study_contests
@@ -50,6 +60,7 @@ PART_TITLES = {
     "bodies": "Distance and difficulty over many bodies",
     "halves": "Distance and the gap of unseen bodies",
     "motion": "Shared and own motion",
+    "shifts": "A new robot or a new lamp",
     "outside": "Outside the protocol",
 }
 SECTIONS: Mapping[str, tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]] = {
@@ -67,6 +78,7 @@ SECTIONS: Mapping[str, tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]]
     "bodies": (("bodies",), ("bodies",), ()),
     "halves": (("halves",), ("halves",), ()),
     "motion": (("motion",), ("motion",), ()),
+    "shifts": (("shifts",), ("shifts",), ()),
     "outside": ((), ("outside",), ()),
 }
 """Content of each part's section: charts, tables that stand open, and tables that are folded away."""
@@ -92,6 +104,16 @@ class Report:
     markdown: str
     summary: pd.DataFrame
     files: Mapping[str, bytes]
+
+
+@dataclass(frozen=True)
+class Others:
+    """Score tables that a study's is compared with."""
+
+    motion: Scores | None = None
+    """The same study in the other kind of motion."""
+    shifted: Sequence[Scores] = ()
+    """The model of the part `shifts` on changed scenes, one table for each change."""
 
 
 @dataclass(frozen=True)
@@ -123,7 +145,7 @@ def build(
     rollouts: Sequence[Path],
     distances: Path | None,
     footer: str,
-    other_motion: Scores | None = None,
+    others: Others | None = None,
 ) -> Report:
     """Make the report of a study.
 
@@ -132,11 +154,12 @@ def build(
         data, rollouts: for pictures; trees of rollouts are named after their variants, or are folders of such trees.
         distances: folder of the distance command; None for the paper's printed distances.
         footer: text of the footer.
-        other_motion: scores of the same study in the other kind of motion.
+        others: tables to compare with.
 
     Raises:
-        ConfigError: a named file cannot be read, or both studies are of one kind of motion.
+        ConfigError: a named file cannot be read, or other tables do not compare.
     """
+    others = others or Others()
     paper = read_paper()
     known = read_distances(distances) if distances else printed_distances(paper)
     videos = find_videos(rollouts) if data and rollouts else {}
@@ -149,8 +172,9 @@ def build(
     note, difficulty, gaps = trainings_note(grades), find_difficulty(grades, known), find_gaps(grades, known)
     tables = _make_tables(builder, scores, known, (note, grades.notes))
     tables += filter(None, (difficulty_table(difficulty, grades.metrics), gaps_table(gaps, grades.metrics)))
-    motions = Motions(scores, other_motion) if other_motion else None
-    tables += [motion_table(motions)] if motions else []
+    motions = Motions(scores, others.motion) if others.motion else None
+    shifts = Shifts(scores, others.shifted) if others.shifted else None
+    tables += [*([motion_table(motions)] if motions else []), *([shifts_table(shifts)] if shifts else [])]
     # A study that has none of the paper's parts is asked none of its claims.
     of_paper = any(builder.has_results(part) for part in PAPER_PARTS)
     findings, by_paper, by_print = (ask(g) if of_paper else [] for g in (StrictGrades(grades), grades, printed))
@@ -164,7 +188,7 @@ def build(
         {HERE: findings, BY_PAPER: by_paper, PRINTED: by_print} if of_paper else {},
         CLAIMS_TEXT,
         {table.name: table for table in tables},
-        study_charts(builder, known, scores.curves) | charts_beyond(builder, difficulty, gaps, motions),
+        study_charts(builder, known, scores.curves) | charts_beyond(builder, difficulty, gaps, motions, shifts),
         strips,
         [*part_notes(builder, scores), *missing_note(missing), *curves_note(scores)],
         missing,

@@ -7,10 +7,10 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 
-from xew.analysis.beyond import Motions, OverBodies, motion_frame, scaling_frame
+from xew.analysis.beyond import Motions, OverBodies, Shifts, motion_frame, scaling_frame, shifts_frame
 from xew.analysis.beyond.scaling import ALONE, GROUPS, PASTED, WITH_ROBOTS
 from xew.analysis.reports import charts
-from xew.analysis.reports.charts import SERIES, SOFT, Chart, Panel, Series
+from xew.analysis.reports.charts import PANEL, SERIES, SOFT, Chart, Panel, Series
 from xew.analysis.statistics.grades import SEEN
 from xew.analysis.tables.builder import Builder
 from xew.analysis.tables.distances import AXIS_TITLES
@@ -20,18 +20,25 @@ from xew.protocol import MOTIONS
 
 METRIC = "lpips"
 KINDS = {kind: Series(kind, color) for kind, color in zip((WITH_ROBOTS, ALONE), SERIES, strict=False)}
+SHIFTS_OF_A_PANEL = 14
+"""Number of bars for which a panel of the usual height has enough space."""
 UNLEARNED = Series(PASTED, SOFT, "-.")
 """Line there of what learned nothing."""
 MOTION_COLORS = dict(zip(MOTIONS, SERIES, strict=False))
 
 
 def charts_beyond(
-    builder: Builder, difficulty: Mapping[str, OverBodies], gaps: Mapping[str, OverBodies], motions: Motions | None
+    builder: Builder,
+    difficulty: Mapping[str, OverBodies],
+    gaps: Mapping[str, OverBodies],
+    motions: Motions | None,
+    shifts: Shifts | None = None,
 ) -> dict[str, Chart]:
     """The charts by name, as far as there is something to draw; `difficulty` and `gaps` by metric."""
     if METRIC not in builder.ours.metrics:
         return {}
     made = {"motion": motion_chart(motions)} if motions and METRIC in motions.metrics else {}
+    made |= {"shifts": shifts_chart(shifts)} if shifts else {}
     if builder.has_results("scaling"):
         made["scaling"] = scaling_chart(builder)
     metric = builder.ours.metrics[METRIC]
@@ -96,6 +103,25 @@ def motion_chart(motions: Motions) -> Chart:
     caption = "Shared motion, in which all robots follow one tool path, and own motion. Lines: 95 % intervals."
     legend = [Series(f"{motion} motion", color) for motion, color in MOTION_COLORS.items()]
     return Chart("motion", caption, panels, data, legend)
+
+
+def shifts_chart(shifts: Shifts) -> Chart:
+    """Costs in LPIPS of unseen robots and of changed scenes, as bars."""
+    data, metric = shifts_frame(shifts, METRIC), shifts.metrics[METRIC]
+
+    def draw(axes: Axes) -> None:
+        values = data[["value", "low", "high"]].to_numpy()
+        charts.bars(axes, data["title"].tolist(), [(SERIES[0], values, np.full(len(data), np.nan))], metric.title)
+        for bar, case in zip(axes.patches, data["case"], strict=True):
+            bar.set_color(SERIES[0] if case in shifts.changes else SERIES[1])
+
+    caption = (
+        "What an unseen robot, and each change of the scene on training robots, adds to the LPIPS of training robots in "
+        "unchanged scenes. Lines: 95 % intervals."
+    )
+    legend = [Series("unseen robot", SERIES[1]), Series("changed scene", SERIES[0])]
+    height = PANEL[1] * (0.3 + len(data) / SHIFTS_OF_A_PANEL)
+    return Chart("shifts", caption, [Panel(f"Added {metric.title}", draw, height)], data, legend)
 
 
 def chart_of_bodies(name: str, caption: str, difficulty: OverBodies, trained: str, title: str) -> Chart:

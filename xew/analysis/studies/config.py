@@ -18,6 +18,7 @@ from xew.protocol import (
     PARTS,
     ROBOT_NAMES,
     SHARED_MOTION,
+    SHIFTS,
     SHOTS,
     SPLITS,
     TASK_COUNT,
@@ -120,6 +121,8 @@ class Study:
     """Settings laid over it for another project's system."""
     motion: str = SHARED_MOTION
     """Kind of motion of all episodes, one of protocol.MOTIONS."""
+    changes: tuple[str, ...] = ()
+    """Changes of the test scenes, such as light:2, on which the model of the part `shifts` is graded; all where left out."""
     other_motion: Path | None = None
     """Folder of the same study in the other kind of motion; the report compares action representations of both."""
     generate: tuple[str, ...] = ()
@@ -200,6 +203,13 @@ class Study:
             if not ending or self._is_repeated(variant)
         )
 
+    @property
+    def shifted_runs(self) -> dict[str, tuple[Run, str]]:
+        """Runs that are graded on changed scenes, each with one change, by names such as `fixed-…@light_2`."""
+        asked = (self.changes or SHIFTS) if "shifts" in self.parts else ()
+        runs = [run for run in self.planned_runs if run.name in (variant.name for variant in PARTS["shifts"])]
+        return {f"{run.name}@{change.replace(':', '_')}": (run, change) for run in runs for change in asked}
+
     def count_trainings(self, variant: Variant) -> int:
         """Number of trainings of a variant."""
         return max(len(self.training_seeds), 1) if self._is_repeated(variant) else 1
@@ -262,6 +272,7 @@ def _check_names(study: Study, path: Path) -> None:
         ("robot", expand_robots(study.robots), _KNOWN_ROBOTS),
         ("number of shots", shots, known_shots),
         ("kind of motion", (study.motion,), MOTIONS),
+        ("change of scenes", study.changes, SHIFTS),
         ("family of test seeds", (study.test_family,), ("test", "final")),
         ("task", study.tasks, study.tasks),  # known: checked above, and may be outside tasks
         ("training seed", tuple(map(str, study.training_seeds)), tuple(map(str, study.training_seeds))),

@@ -95,6 +95,13 @@ def estimate(study: Study, steps: Mapping[str, Step]) -> dict[str, Cost]:
             ),
             f"evaluate/{variant.name}": Cost(graded, "videos", rates.start_s + graded * rates.grade_s),
         }
+    for name, (run, _) in study.shifted_runs.items():
+        count = study.task_count * study.test_seeds * len([robot for robot in run.seen_robots if robot in study.robot_keys])
+        costs |= {
+            f"generate/{name}": Cost(count, "episodes", rates.start_s + count * rates.episode_s, count * rates.episode_mb),
+            f"rollout/{name}": Cost(count, "episodes", rates.start_s + count * rates.rollout_s, count * rates.rollout_mb),
+            f"evaluate/{name}": Cost(count, "videos", rates.start_s + count * rates.grade_s),
+        }
     videos = tested * len(BASELINES)
     costs["baselines"] = Cost(videos, "videos", rates.start_s + videos * rates.grade_s)
     pairs = math.comb(len(ROBOT_NAMES) + len(measured_bodies(study)), 2)

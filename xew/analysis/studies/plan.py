@@ -19,7 +19,7 @@ from typing import Any
 import yaml
 
 import xew
-from xew.analysis.studies.config import Settings, Study, build_experiment, run_folder
+from xew.analysis.studies.config import Run, Settings, Study, build_experiment, run_folder
 from xew.episode import SCHEMA_VERSION
 from xew.files import file_digest, read_text, write_text
 from xew.protocol import DISTANCE_BODIES, GRADING_PROTOCOL, SHARED_MOTION, Variant
@@ -72,6 +72,8 @@ def plan(study: Study) -> dict[str, Step]:
             _plan_rollout(study, variant, experiment),
             _plan_evaluate(study, variant),
         ]
+    for name, (run, change) in study.shifted_runs.items():
+        steps += _plan_shift(study, name, run, change, experiments[run.name])
     steps.insert(2, _plan_baselines(study, study.planned_runs[0], experiments[study.planned_runs[0].name]))
     if {"loeo", "bodies", "halves"}.intersection(study.parts):
         steps.append(_plan_distances(study))
@@ -178,6 +180,51 @@ def _plan_rollout(study: Study, variant: Variant, experiment: Settings) -> Step:
         inputs=[settings, robots],
         product=out,
     )
+
+
+def _plan_shift(study: Study, name: str, run: Run, change: str, experiment: Settings) -> list[Step]:
+    """Making of changed test scenes of a run's training robots, its rollouts on them, and their grading."""
+    data = study.out / f"data_{change.replace(':', '_')}"
+    robots = tuple(robot for robot in run.seen_robots if robot in study.robot_keys)
+    if change.startswith("height"):
+        counts = {"train": 0, "test": 0} | {study.test_family: study.test_seeds}
+        seeds = tuple(text for family, count in counts.items() for text in (f"--{family}-seeds", str(count)))
+        tasks = ("--tasks", *study.tasks) if study.tasks else ()
+        motion = () if study.motion == SHARED_MOTION else ("--motion", study.motion)
+        command = ("xew.sim_warp.generate", *tasks, "--robots", *robots, *seeds, *motion, *study.generate)
+    else:
+        command = ("xew.sim_warp.inspect", str(study.data_folder), "--render", "--split", study.test_family)
+    made = Step(
+        "generate",
+        name,
+        (*command, "--change", change, "--out", str(data)),
+        needs=("generate",),
+        inputs=[change, robots, study.test_seeds, *_other_family(study)],
+        product=data,
+        every_gpu=change.startswith("height"),
+    )
+    rollout = _plan_rollout(study, run, experiment)
+    out = _rollouts_path(study, name)
+    moved = {str(study.data_folder): str(data), str(rollout.product): str(out)}
+    asked = rollout.command[: rollout.command.index("--robots") + 1], rollout.command[rollout.command.index("--out") :]
+    rolled = replace(
+        rollout,
+        variant=name,
+        command=tuple(moved.get(text, text) for text in (*asked[0], *robots, *asked[1])),
+        needs=(made.name, _training_name(run)),
+        inputs=[*rollout.inputs, change],
+        product=out,
+    )
+    scores = study.scores_path(name)
+    graded = Step(
+        "evaluate",
+        name,
+        ("xew.metrics.evaluate", str(out), "--data", str(data), "--out", str(scores), "--no-baselines", *study.evaluate),
+        needs=(made.name, rolled.name),
+        inputs=[study.evaluate, GRADING_PROTOCOL, change],
+        product=scores,
+    )
+    return [made, rolled, graded]
 
 
 def _plan_baselines(study: Study, variant: Variant, experiment: Settings) -> Step:

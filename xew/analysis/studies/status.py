@@ -18,13 +18,16 @@ COLUMNS = ("latents", "train", "rollout", "evaluate")
 def format_status(study: Study, steps: Mapping[str, Step], ledger: Ledger, failed: Mapping[str, str] | None = None) -> str:
     """A row per variant and a column per kind of step: the time of what is done, FAILED, blocked, begun, or '-'."""
     ledger.find_all_done(steps)
-    width = max(len(variant.name) for variant in study.planned_runs) + 2
+    width = max(map(len, [*(variant.name for variant in study.planned_runs), *study.shifted_runs])) + 2
     lines = [f"{'variant':<{width}}" + "".join(f"{kind:>12}" for kind in COLUMNS)]
     for variant in study.planned_runs:
         training = "adapt" if variant.target else "train"
         names = [f"{training if kind == 'train' else kind}/{variant.name}" for kind in COLUMNS]
         states = (_format_state(steps[name], ledger, failed or {}) for name in names)
         lines.append(f"{variant.name:<{width}}" + "".join(f"{state:>12}" for state in states))
+    for name in study.shifted_runs:
+        states = (_format_state(steps[f"{kind}/{name}"], ledger, failed or {}) for kind in ("rollout", "evaluate"))
+        lines.append(f"{name:<{width}}" + " " * 24 + "".join(f"{state:>12}" for state in states))
     lines += [f"{name:<{width}}{_format_state(steps[name], ledger, failed or {}):>12}" for name in steps if "/" not in name]
     lines += [f"test scenes: seeds from {SEED_STARTS[study.test_family]:,} (family {study.test_family})"]
     return "\n".join(lines)

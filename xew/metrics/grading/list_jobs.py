@@ -8,7 +8,7 @@ from tqdm import tqdm
 
 from xew.concurrency import map_in_order
 from xew.config import ConfigError
-from xew.dataset import Episode, demand_one_motion, find_accepted
+from xew.dataset import Episode, demand_one_change, demand_one_motion, find_accepted
 from xew.episode import EpisodeError, Record, episode_folder, read_record
 from xew.files import digest_files
 from xew.metrics.grading.baselines import BASELINES
@@ -46,6 +46,8 @@ class Listing:
     motion: str
     errors: Sequence[str]
     """Messages about rollouts that cannot be graded and are left out."""
+    change: str
+    """The change of all scenes, see `dataset.demand_one_change`."""
 
 
 def list_jobs(settings: GradingSettings, baselines: Collection[str] | None = None) -> Listing:
@@ -76,8 +78,8 @@ def list_jobs(settings: GradingSettings, baselines: Collection[str] | None = Non
         jobs = _list_baseline_jobs(settings, baselines, codecs)
     else:
         jobs = _list_rollout_jobs(rollouts, settings, baselines, codecs, problems)
-    motion = demand_one_motion(args.data, {job.episode: job.record for job in jobs}.values())
-    return Listing(jobs, codecs, motion, errors)
+    records = {job.episode: job.record for job in jobs}.values()
+    return Listing(jobs, codecs, demand_one_motion(args.data, records), errors, demand_one_change(args.data, records))
 
 
 def _list_rollout_jobs(

@@ -27,6 +27,7 @@ import pyarrow.parquet as pq
 
 import xew
 from xew.config import ConfigError
+from xew.dataset import folder_beside
 from xew.episode import place_episode
 from xew.files import read_json, replacing, write_bytes
 from xew.metrics import METRICS
@@ -143,8 +144,9 @@ def surfaces_folder(data: Path, out: Path) -> Path:
 def folder_beside_data(data: Path, out: Path, name: str) -> Path:
     """Folder for what is made of a data set once, for all score tables: next to the data, or next to the table where that
     cannot be written to or is a link."""
-    folder = data.absolute().with_name(f"{data.absolute().name}-{name}")
-    writable = not folder.is_symlink() and os.access(folder if folder.exists() else folder.parent, os.W_OK)
+    folder = folder_beside(data.absolute(), name)
+    there = next(path for path in (folder, *folder.parents) if path.exists())
+    writable = not folder.is_symlink() and os.access(there, os.W_OK)
     return folder if writable else path_beside(out, name)
 
 

@@ -1,7 +1,7 @@
 """The options of `evaluate`, and what they are resolved to before anything is read."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -9,12 +9,13 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from xew.config import ConfigError, pick, suggestion
+from xew.dataset import view_folder
 from xew.metrics import METRICS
 from xew.metrics.backends import MASKERS, TRACKERS, identity
 from xew.metrics.grading.scores import CellStore, baselines_folder, path_beside, surfaces_folder
 from xew.metrics.grading.weights import check_weights
 from xew.metrics.metric import SUITES
-from xew.protocol import GRADING_PROTOCOL
+from xew.protocol import GRADING_PROTOCOL, HEAD
 
 
 @dataclass(frozen=True)
@@ -69,6 +70,8 @@ class Args:
     """With --check: grade this number of its videos again and compare."""
     trust: tuple[str, ...] = ()
     """Modules with custom tasks and robots, such as my_lab.tasks, that the data may name."""
+    view: str = HEAD
+    """View of the data set that the rollouts predict, such as wrist_left."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +105,9 @@ def resolve(args: Args) -> GradingSettings:
 
     Raises:
         ConfigError: a name is unknown, a checkpoint does not exist, no metric is left, or a metric lacks its weights.
+        EpisodeError: the data set does not have the view.
     """
+    args = replace(args, data=view_folder(args.data, args.view), view=HEAD)
     metrics = choose_metrics(args.metrics, args.suite)
     check_weights(metrics)
     estimators = {

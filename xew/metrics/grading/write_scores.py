@@ -32,7 +32,8 @@ def write_scores(settings: GradingSettings, listing: Listing) -> str:
     attributes = describe(settings.choices, settings.metrics)
     if settings.args.rollouts and listing.codecs:
         attributes |= {"codecs": {model: [codec.key] for model, codec in sorted(listing.codecs.items())}}
-    write_tables(out, attributes | {"motion": listing.motion}, cells, settings.store)
+    attributes |= {"motion": listing.motion} | ({"change": listing.change} if listing.change else {})
+    write_tables(out, attributes, cells, settings.store)
     rows = pd.read_parquet(out)
     write_bundle(path_beside(out, "bundle.json"), out, rows, cells)
     return _write_summary(out, rows, settings.args.resample)

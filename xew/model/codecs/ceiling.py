@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from xew.model.codecs.contract import Codec, given_frames
-from xew.model.video.frames import to_camera_size, to_model_size
+from xew.model.video.frames import picture_size, to_camera_size, to_model_size
 
 T = TypeVar("T")
 Video = UInt8[np.ndarray, "_ h w 3"]
@@ -70,7 +70,7 @@ def reconstruct(
     clip = to_model_size(truth[np.minimum(np.arange(frames), len(truth) - 1)], height, width)
     shown = clip[:1] if scene is None else to_model_size(scene, height, width)
     given = None if render is None else given_frames(to_model_size(render, height, width), shown, 0, frames)
-    return to_camera_size(codec.decode(codec.encode(clip), given))[: len(truth)]
+    return to_camera_size(codec.decode(codec.encode(clip), given), picture_size(truth))[: len(truth)]
 
 
 def choose_evenly(items: Sequence[T], count: int) -> list[T]:

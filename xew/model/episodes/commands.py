@@ -17,6 +17,6 @@ def episode_command(
         folder: of the episode.
         record: of the episode.
         rendered: [t 240 320 3] uint8, the robot alone, if in memory; otherwise its video is read when needed.
-        scene: [t 240 320 3] uint8, the episode's video, if in memory; conditions see its first frame alone.
+        scene: [n 240 320 3] uint8, the first frames of the episode's video, if in memory; conditions see one alone.
     """
     return make_command(folder, record, read_states(folder, record), rendered, scene)

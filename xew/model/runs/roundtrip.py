@@ -13,7 +13,7 @@ from xew.model.conditions import shown_scene, shows_carried
 from xew.model.episodes.commands import episode_command
 from xew.model.experiment import Experiment, load_experiment
 from xew.model.runs.folder import load_run
-from xew.model.video.frames import to_camera_size, to_model_size
+from xew.model.video.frames import picture_size, to_camera_size, to_model_size
 
 LENGTH_BLOCK = 24
 """Number of frames after the first in a piece; a multiple of four."""
@@ -58,7 +58,8 @@ class RunRoundtrip:
         block = LENGTH_BLOCK if self.codec.groups_independent else len(small) - 1
         given = self._read_given(episode) if episode is not None and self.sees_render else None
         coded = [self._code(small, given, start, block) for start in range(0, max(len(small) - 1, 1), max(block, 1))]
-        return to_camera_size(np.concatenate([coded[0][:1], *(piece[1:] for piece in coded)])[: len(video)])
+        joined = np.concatenate([coded[0][:1], *(piece[1:] for piece in coded)])
+        return to_camera_size(joined[: len(video)], picture_size(video))
 
     def _read_given(self, episode: Path) -> tuple[np.ndarray, np.ndarray]:
         """Render [t h w 3] and scene [t h w 3] or [1 h w 3] of an episode, uint8 at the model's size."""

@@ -22,32 +22,21 @@ from flax import nnx
 from jax import Array
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from xew.concurrency import map_in_order
 from xew.config import pick
 from xew.dataset import Episode
-from xew.episode import Record, read_pixels
-from xew.model.cache.clips import gives_render, needed_pixels, read_streams, take_frames
+from xew.episode import Record
+from xew.model.cache.clips import gives_render
 from xew.model.cache.scales import Scale, apply_scales
-from xew.model.codecs.contract import Codec, GivenFrames, encode_pictures, given_frames, to_pictures, to_signed
-from xew.model.conditions import Condition, clip_numbers, shows_carried
+from xew.model.codecs.contract import Codec, GivenFrames, encode_pictures, to_pictures, to_signed
+from xew.model.conditions import clip_numbers
 from xew.model.devices.sharding import batch_sharding, replicated_sharding
 from xew.model.diffusion.samplers import SAMPLERS, NoiseSchedule
-from xew.model.episodes.commands import episode_command
 from xew.model.experiment import Experiment
 from xew.model.network.dit import WorldModel, cast_params, network_graph
+from xew.model.sampling.reading import FIRST, RENDER, SCENE, EpisodeInputs, EpisodeReader, Streams
 from xew.model.settings.parts import ClipInputs
 from xew.model.settings.settings import RolloutSettings
 from xew.model.text.instructions import Instructions
-from xew.model.video.frames import to_model_size
-from xew.model.video.pixels import stored_pixels
-
-Streams = dict[str, np.ndarray]
-"""Inputs of one whole episode by stream: uint8 [t h w 3] or float32 [t n]; with FIRST and, for some decoders, RENDER, SCENE."""
-EpisodeInputs = tuple[Record, Streams]
-"""An episode that was read."""
-FIRST = "first frame"
-RENDER = "render"
-SCENE = "scene"
 
 
 class ChunkInputs(NamedTuple):
@@ -113,7 +102,7 @@ class Predictor:
 
         Frame 0 is the codec's reconstruction of the first frame. Results do not depend on the batch.
         """
-        return self.begin(list(map_in_order(self.read, episodes)), frame_count).fetch()
+        return self.begin(list(self.reader.read_ahead(episodes)), frame_count).fetch()
 
     def begin(self, episodes: Sequence[EpisodeInputs], frame_count: int, batch: int = 1) -> Prediction:
         """Start to predict the first `frame_count` frames of episodes that were read, without waiting for the devices.
@@ -123,15 +112,16 @@ class Predictor:
         size = max(len(episodes), batch)
         size += -size % self._devices
         padded = [*episodes, *[episodes[-1]] * (size - len(episodes))]
-        records, streams = [record for record, _ in padded], self._stack([streams for _, streams in padded], frame_count)
+        records, streams = [record for record, _ in padded], [streams for _, streams in padded]
         text, negative = self._encode_text(records)
         names = self._place(np.array([name_number(record) for record in records], np.uint32))
+        first = self._join(streams, FIRST, np.zeros(1, int))
         unaligned, sampling = self._encode_unaligned(streams), self._sampling
         chunks: list[Array] = []
         for number, start in enumerate(range(0, max(frame_count - 1, 1), self.inputs.clip.frames - 1)):
-            history = self._encode_history(streams[FIRST], chunks, start)
+            history = self._encode_history(first, chunks, start)
             conditions = unaligned | history | self._encode_conditions(streams, start)
-            reference, given = chunks[-1][:, -1:] if chunks else streams[FIRST], self._give_frames(streams, start)
+            reference, given = chunks[-1][:, -1:] if chunks else first, self._give_frames(streams, start)
             inputs = ChunkInputs(reference, conditions, text, negative, names, number, given)
             with jax.set_mesh(self._mesh) if self._mesh is not None else nullcontext():
                 chunks.append(predict_chunk(self.graph, self.params, self.codec, inputs, sampling))
@@ -142,44 +132,28 @@ class Predictor:
         settings = self.settings
         return ChunkSampling(settings.sampler, self.schedule, settings.guidance, self.inputs.latent_shape, settings.seed)
 
-    def read(self, episode: Episode) -> EpisodeInputs:
-        """Read the first frame of an episode and its conditions; threads may call it."""
-        inputs, (folder, record), clip = self.inputs, episode, self.inputs.clip
-        names = [name for name, condition in inputs.conditions.items() if condition.make is not None]
-        pixels = stored_pixels(folder, record, needed_pixels(inputs.conditions, names))
-        command = episode_command(folder, record, pixels.get("robot"), pixels.get("rgb"))
-        given = {FIRST: read_pixels(folder, "rgb", most=1, record=record)}
-        if gives_render(self.codec, inputs.conditions):
-            scene = command.carried_scene if shows_carried(inputs.conditions.values()) else given[FIRST]
-            given |= {RENDER: pixels["robot"], SCENE: scene}
-        resized = {name: to_model_size(video, clip.height, clip.width) for name, video in given.items()}
-        return record, resized | read_streams(inputs.conditions, clip, folder, record, names, pixels, command)
+    @property
+    def reader(self) -> EpisodeReader:
+        """Reader of the inputs of `begin`."""
+        conditions = self.inputs.conditions
+        return EpisodeReader(conditions, self.inputs.clip, gives_render(self.codec, conditions))
 
-    def _stack(self, episodes: Sequence[Streams], frame_count: int) -> dict[str, Any]:
-        """Streams of a batch: numbers [b t n], which the host cuts, and pictures [b t h w 3] on the devices.
+    def _join(self, episodes: Sequence[Streams], name: str, frames: np.ndarray) -> Array:
+        """These frames of a picture stream of every episode [b t h w 3], on the devices; ends of episodes are repeated."""
+        videos = [streams[name] for streams in episodes]
+        joined = np.empty((len(videos), len(frames), *videos[0].shape[1:]), np.uint8)
+        for row, video in zip(joined, videos, strict=True):
+            video.take(frames, axis=0, out=row, mode="clip")
+        return self._place(joined)
 
-        Of pictures that follow the episode the last is repeated to the end of the last chunk, so few lengths are compiled.
-        """
-        step = self.inputs.clip.frames - 1
-        frames = max(-(-(frame_count - 1) // step), 1) * step + 1
-
-        def join(name: str) -> Any:
-            arrays = [streams[name] for streams in episodes]
-            if arrays[0].ndim == 2:
-                return arrays
-            still = name in (FIRST, SCENE) and all(len(video) == 1 for video in arrays)
-            if still or (name in self.inputs.conditions and not self.inputs.conditions[name].aligned):
-                return self._place(np.stack(arrays))
-            follows = frames + (name == RENDER)  # the decoder looks one frame ahead
-            return self._place(np.stack([take_frames(video, 0, follows) for video in arrays]))
-
-        return {name: join(name) for name in episodes[0]}
-
-    def _give_frames(self, streams: Mapping[str, Any], start: int) -> GivenFrames | None:
-        """What the decoder is given of the chunk that begins at frame `start`."""
-        if RENDER not in streams:
+    def _give_frames(self, episodes: Sequence[Streams], start: int) -> GivenFrames | None:
+        """What the decoder is given of the chunk that begins at frame `start`; as `given_frames`."""
+        if RENDER not in episodes[0]:
             return None
-        return given_frames(streams[RENDER], streams[SCENE], start, self.inputs.clip.frames)
+        end = start + self.inputs.clip.frames
+        moves = any(len(streams[SCENE]) > 1 for streams in episodes)
+        shown = np.arange(start, end if moves else start + 1)
+        return GivenFrames(self._join(episodes, RENDER, np.arange(start - 1, end + 1)), self._join(episodes, SCENE, shown))
 
     def _encode_text(self, records: Sequence[Record]) -> tuple[Any, Any]:
         """Encode the instructions and, with guidance, as many negative prompts."""
@@ -192,23 +166,26 @@ class Predictor:
         negative = self.instructions.encode([settings.negative_prompt])[settings.negative_prompt]
         return text, self._place(np.stack([negative] * len(records)))
 
-    def _encode_unaligned(self, streams: Mapping[str, Any]) -> dict[str, Array]:
+    def _encode_unaligned(self, episodes: Sequence[Streams]) -> dict[str, Array]:
         """Encode the pictures that every chunk reuses."""
         return {
-            name: encode_pictures(self.codec, streams[name])
+            name: encode_pictures(self.codec, self._join(episodes, name, np.arange(len(episodes[0][name]))))
             for name, condition in self.inputs.conditions.items()
-            if _is_picture(condition, streams.get(name)) and not condition.aligned
+            if condition.make is not None and not condition.aligned
         }
 
-    def _encode_conditions(self, streams: Mapping[str, Any], start: int) -> dict[str, Array]:
+    def _encode_conditions(self, episodes: Sequence[Streams], start: int) -> dict[str, Array]:
         """Encode aligned conditions of the chunk that begins at frame `start`."""
         frames, history = self.inputs.clip.frames, self.inputs.history
         pictures, numbers = {}, {}
         for name, condition in self.inputs.conditions.items():
-            if _is_picture(condition, streams.get(name)) and condition.aligned:
-                pictures[name] = encode_pictures(self.codec, jax.lax.dynamic_slice_in_dim(streams[name], start, frames, axis=1))
-            elif isinstance(streams.get(name), list):
-                numbers[name] = np.stack([clip_numbers(condition, whole, start, frames, history) for whole in streams[name]])
+            if condition.make is None or not condition.aligned:
+                continue
+            if episodes[0][name].ndim == 2:
+                clips = [clip_numbers(condition, streams[name], start, frames, history) for streams in episodes]
+                numbers[name] = np.stack(clips)
+            else:
+                pictures[name] = encode_pictures(self.codec, self._join(episodes, name, np.arange(start, start + frames)))
         scaled = apply_scales(self.scales, self.inputs.conditions, numbers)
         return pictures | {name: self._place(array) for name, array in scaled.items()}
 
@@ -217,10 +194,16 @@ class Predictor:
         names = [name for name, condition in self.inputs.conditions.items() if condition.make is None]
         if not names:
             return {}
-        past = jnp.concatenate([first, *(chunk[:, 1:] for chunk in chunks)], axis=1)
         earlier = np.maximum(start + np.asarray(self.inputs.history), 0)
-        encoded = [encode_pictures(self.codec, past[:, frame : frame + 1]) for frame in earlier]
+        encoded = [encode_pictures(self.codec, self._find_frame(first, chunks, int(frame))) for frame in earlier]
         return dict.fromkeys(names, jnp.concatenate(encoded, axis=1))
+
+    def _find_frame(self, first: Array, chunks: Sequence[Array], frame: int) -> Array:
+        """A frame [b 1 h w 3] of what was predicted; where it lies is no constant of the compiled slice."""
+        if frame == 0:
+            return first
+        number, place = divmod(frame - 1, self.inputs.clip.frames - 1)
+        return jax.lax.dynamic_slice_in_dim(chunks[number], place + 1, 1, axis=1)
 
     @property
     def _mesh(self) -> Mesh | None:
@@ -285,8 +268,3 @@ def guided_velocity(model: WorldModel, inputs: ChunkInputs, guidance: float) -> 
 def _make_velocity(model: WorldModel, conditions: Mapping[str, Array], text: Array) -> Callable[[Array, Array], Array]:
     cache = model.condition_cache(conditions, text) if model.one_way and model.condition_streams else None
     return lambda latents, level: model(latents, conditions, level, text, cache)
-
-
-def _is_picture(condition: Condition, stream: Any) -> bool:
-    """Whether a stream of a batch is pictures [b t h w 3] of a condition, not numbers of each episode."""
-    return condition.make is not None and stream is not None and not isinstance(stream, list)

@@ -113,7 +113,7 @@ class RolloutSettings:
     instructions."""
     negative_prompt: str = ""
     batch: int = 15
-    """Number of episodes at once, over all devices."""
+    """Number of episodes that a GPU predicts at once."""
     max_frames: int = 0
     """Number of frames to predict of each episode; 0 predicts all."""
     seed: int = 0

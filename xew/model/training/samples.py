@@ -23,7 +23,7 @@ from xew.model.runs.log import RunLog
 from xew.model.sampling.predict import make_predictor
 from xew.model.settings.settings import TrainSettings
 from xew.model.video.comparison import strip
-from xew.model.video.frames import to_camera_size
+from xew.model.video.frames import picture_size, to_camera_size
 from xew.protocol import PASTED_RENDER
 
 CHUNKS = 2
@@ -92,7 +92,7 @@ class SampleRollouts:
         if log is None:
             return
         videos = {
-            name: to_camera_size(video)[: len(self.truths[name].truth.rgb)]
+            name: to_camera_size(video, picture_size(self.truths[name].truth.rgb))[: len(self.truths[name].truth.rgb)]
             for name, video in zip(self.episodes, predicted, strict=True)
         }
         log.scalars(step, self._mean_scores(videos) | self.pasted_scores)

@@ -1,4 +1,4 @@
-"""Pinhole cameras by the convention of `xew.episode.project`. All episodes are rendered by HEAD_CAMERA."""
+"""Pinhole cameras by the convention of `xew.episode.project`; the named ones are in `xew.sim_warp.cameras`."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -7,6 +7,7 @@ import numpy as np
 
 from xew import episode
 from xew.episode import HEIGHT, WIDTH
+from xew.protocol import HEAD_SPEC, CameraSpec
 
 
 @dataclass(frozen=True)
@@ -16,14 +17,21 @@ class Camera:
     intrinsics: np.ndarray = field(repr=False)
     """[3 3] float64, K [pixels]; the principal point of a centered camera is ((width - 1) / 2, (height - 1) / 2)."""
     extrinsics: np.ndarray
-    """[4 4] float64, world to camera [m]."""
+    """[4 4] float64, world to camera [m]; [t 4 4] for a camera that moves, one pose for each frame."""
     width: int = WIDTH
     height: int = HEIGHT
 
     @property
     def position(self) -> np.ndarray:
-        """[3] center of projection, world frame [m]."""
+        """[3] center of projection, world frame [m]; [t 3] of a camera that moves."""
+        if self.moves:
+            return -np.einsum("tji,tj->ti", self.extrinsics[:, :3, :3], self.extrinsics[:, :3, 3])
         return -self.extrinsics[:3, :3].T @ self.extrinsics[:3, 3]
+
+    @property
+    def moves(self) -> bool:
+        """Whether there is a pose for each frame."""
+        return self.extrinsics.ndim == 3
 
 
 def look_at(
@@ -62,5 +70,10 @@ def project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     return episode.project(points, camera.intrinsics, camera.extrinsics)
 
 
-HEAD_CAMERA = look_at(position=(-0.032, -0.45, 1.35), target=(-0.032, 0.15, 0.55))
+def spec_camera(spec: CameraSpec) -> Camera:
+    """The camera in the frame of what it is fixed to, [4 4] from that frame to the camera's."""
+    return look_at(spec.position, spec.target, spec.up, spec.vertical_fov, *spec.size)
+
+
+HEAD_CAMERA = spec_camera(HEAD_SPEC)
 """RoboTwin's head camera: fixed above the table, 53 degrees down, vertical field of view 37 degrees."""

@@ -16,12 +16,14 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from tqdm import tqdm
 
 import xew
-from xew.dataset import Episode, demand_one_rate
+from xew.dataset import Episode, demand_one_rate, view_episode
 from xew.episode import EpisodeError, States, data_folder, read_pixels, read_states
 from xew.files import hold_lock, read_text, write_text
+from xew.protocol import HEAD
 from xew.rollout import Rollout, find_rollouts, read_as_graded
 from xew.sim_warp.inspection.films import Row, difference_video, tile_frames, tile_size, write_film
 from xew.sim_warp.inspection.overlays import frame_psnr, overlay_data
+from xew.sim_warp.inspection.pictures import fit_picture
 from xew.sim_warp.robots import ROBOTS, recorded_robot
 
 __all__ = ["Page", "Predictions", "Scene", "choose_scenes", "find_predictions", "write_page"]
@@ -69,6 +71,8 @@ class Page:
     """Whether optical flow is rendered from the commands."""
     given: bool = True
     """Whether rollouts hold the given frame 0; otherwise they begin with frame 1."""
+    views: Sequence[str] = (HEAD,)
+    """Views besides `head` whose videos are shown below the head camera's."""
 
 
 def find_predictions(roots: Iterable[Path]) -> Predictions:
@@ -173,6 +177,8 @@ def _write_scene(number: int, scene: Scene, page: Page, out: Path) -> dict[str, 
     rows: dict[str, Row] = {"video": truths}
     if page.flow:
         rows["flow"] = [_flow(cell, of_cell) for cell, of_cell in zip(scene.cells, states, strict=True)]
+    for view in (view for view in page.views if view != HEAD):
+        rows[view] = [_fit(read_pixels(view_episode(folder, view), "rgb"), truths[0]) for folder, _ in scene.cells]
     content = {
         "frames": max(map(len, truths)),
         "rate": rate,
@@ -223,12 +229,19 @@ def _write_films(stem: str, scene: Scene, page: Page, rows: dict[str, Row], out:
     return films
 
 
+def _fit(video: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """A video [t h w 3] that fits into the size of another one."""
+    return np.stack([fit_picture(frame, *other.shape[1:3]) for frame in video])
+
+
 def _flow(cell: Episode, states: States) -> np.ndarray:
     """The commanded robot's optical flow as a color wheel on white: [t h w 3] uint8."""
-    from xew.sim_warp.rendering.streams import command_streams, flow_to_rgb  # here: a page without flow needs no Warp
+    from xew.sim_warp.cameras import commanded_camera  # here: a page without flow needs no Warp
+    from xew.sim_warp.rendering.streams import command_streams, flow_to_rgb
 
     folder, record = cell
-    return flow_to_rgb(command_streams(recorded_robot(record.robot, data_folder(folder)), states.action).optical_flow)
+    robot = recorded_robot(record.robot, data_folder(folder))
+    return flow_to_rgb(command_streams(robot, states.action, commanded_camera(record.camera, robot, states)).optical_flow)
 
 
 def _models(scene: Scene, predictions: Predictions) -> list[tuple[str, list[Rollout | None]]]:

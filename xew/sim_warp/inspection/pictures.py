@@ -2,6 +2,7 @@
 
 import math
 from collections import defaultdict
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -9,9 +10,11 @@ import numpy as np
 from PIL import Image
 from tqdm import tqdm
 
+from xew.dataset import view_episode
 from xew.episode import HEIGHT, WIDTH, EpisodeError, Record, encode_png, read_pixels, read_record, read_states
 from xew.files import replacing, write_bytes
 from xew.names import folder_name, path_below
+from xew.protocol import HEAD
 from xew.sim_warp.robots import ROBOTS
 
 STRIP_FRAMES = 8
@@ -26,13 +29,13 @@ LABEL_WIDTH, LABEL_HEIGHT, TEXT_SCALE = 96, 24, 0.42
 """Size of the labels in a grid or sheet [pixels], and the scale of their letters."""
 
 
-def draw_pictures(cells: list[tuple[Path, Record]], out: Path, seeds: int) -> None:
-    """Draw sheets and strips of the first seeds of each task, as PNG."""
+def draw_pictures(cells: list[tuple[Path, Record]], out: Path, seeds: int, views: Sequence[str] = (HEAD,)) -> None:
+    """Draw sheets, with these views side by side, and strips of the first seeds of each task, as PNG."""
     by_task = seeds_by_task(cells)
     _make_folder(out, "--pictures")
     for task, of_task in tqdm(by_task.items(), desc="drawing", unit="task"):
         for seed in sorted(of_task)[:seeds]:
-            save_png(path_below(out, f"{folder_name(task)}_{seed}.png"), contact_sheet(of_task[seed]))
+            save_png(path_below(out, f"{folder_name(task)}_{seed}.png"), contact_sheet(of_task[seed], views))
             for folder, record in of_task[seed]:
                 save_png(path_below(out, f"{folder_name(task)}_{seed}_{folder_name(record.robot)}.png"), strip(folder))
 
@@ -88,9 +91,14 @@ def _column(cells: list[tuple[Path, Record]], robots: list[str]) -> np.ndarray:
     """A task's name over one picture per robot: [h w 3] uint8."""
     folders = {record.robot: folder for folder, record in cells}
     instants = dict(zip(folders, busy_instants([read_states(folder).contact for folder in folders.values()]), strict=True))
-    images = [_halve(read_pixels(folders[robot], "rgb")[instants[robot]]) if robot in folders else BLANK for robot in robots]
+    images = [_small(folders[robot], instants[robot]) if robot in folders else BLANK for robot in robots]
     name = cells[0][1].task.rsplit(":", 1)[-1]
     return np.concatenate([_label(name, WIDTH // 2 + GAP), tile([[image] for image in images])])
+
+
+def _small(folder: Path, instant: int) -> np.ndarray:
+    """A frame of an episode at half the head camera's size."""
+    return fit_picture(read_pixels(folder, "rgb")[instant], HEIGHT // 2, WIDTH // 2)
 
 
 def busy_instants(contacts: list[np.ndarray]) -> list[int]:
@@ -117,16 +125,20 @@ def _label(text: str, width: int, height: int = LABEL_HEIGHT) -> np.ndarray:
     return cv2.putText(image, text, place, cv2.FONT_HERSHEY_SIMPLEX, scale, (40, 40, 40), 1, cv2.LINE_AA)
 
 
-def _halve(image: np.ndarray) -> np.ndarray:
-    return cv2.resize(image, (image.shape[1] // 2, image.shape[0] // 2), interpolation=cv2.INTER_AREA)
+def fit_picture(image: np.ndarray, height: int = HEIGHT, width: int = WIDTH) -> np.ndarray:
+    """An image [h w 3] brought to a size with its aspect ratio, and white at the right or below."""
+    scale = min(height / image.shape[0], width / image.shape[1])
+    inner = round(image.shape[1] * scale), round(image.shape[0] * scale)
+    resized = cv2.resize(image, inner, interpolation=cv2.INTER_AREA)
+    return np.pad(resized, ((0, height - inner[1]), (0, width - inner[0]), (0, 0)), constant_values=255)
 
 
-def contact_sheet(cells: list[tuple[Path, Record]]) -> np.ndarray:
-    """The instruction over one row per robot: its start, middle and end: [h w 3] uint8."""
+def contact_sheet(cells: list[tuple[Path, Record]], views: Sequence[str] = (HEAD,)) -> np.ndarray:
+    """The instruction over one row per robot: its start, middle and end in each view: [h w 3] uint8."""
     rows = []
     for folder, _ in cells:
-        video = read_pixels(folder, "rgb")
-        rows.append([video[round(time * (len(video) - 1))] for time in SHEET_TIMES])
+        videos = [read_pixels(view_episode(folder, view), "rgb") for view in views]
+        rows.append([fit_picture(video[round(time * (len(video) - 1))]) for video in videos for time in SHEET_TIMES])
     names = np.concatenate([_label(record.robot, LABEL_WIDTH, HEIGHT + GAP) for _, record in cells])
     pictures = np.concatenate([names, tile(rows)], 1)
     record = cells[0][1]

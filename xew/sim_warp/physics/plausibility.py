@@ -72,7 +72,7 @@ def _name_partner(scene: Scene, index: int, penetration: np.ndarray, contact: np
 
 def _find_fallen(scene: Scene, object_pose: np.ndarray, frame_rate: float) -> str | None:
     half = np.array(TABLE_SIZE[:2]) / 2
-    outside = (np.abs(object_pose[..., :2]) > half).any(-1) | (object_pose[..., 2] < TABLE_TOP - BELOW_TABLE)
+    outside = (np.abs(object_pose[..., :2]) > half).any(-1) | (object_pose[..., 2] < TABLE_TOP + scene.raised - BELOW_TABLE)
     for name, left in zip(scene.names, outside.T, strict=True):
         if left.any():
             return f"the {name} left the table at {np.argmax(left) / frame_rate:.1f} s"

@@ -265,7 +265,8 @@ def _add_finger_joint(
 
 def _add_objects(builder: "newton.ModelBuilder", scene: Scene) -> None:
     table = trimesh.creation.box((TABLE_SIZE[0], TABLE_SIZE[1], TABLE_SIZE[2]))
-    _add_hull(builder, -1, table.vertices + [0, 0, TABLE_TOP - TABLE_SIZE[2] / 2], LINK_FRICTION, OBJECT_GROUP, "table")
+    center = [0, 0, TABLE_TOP + scene.raised - TABLE_SIZE[2] / 2]
+    _add_hull(builder, -1, table.vertices + center, LINK_FRICTION, OBJECT_GROUP, "table")
     free = [thing for thing in scene.objects if not thing.is_fixed]
     hinged = [thing for thing in scene.objects if thing.hinge]
     if len(free) > FREE_SLOTS or len(hinged) > 1 or any(not thing.is_fixed for thing in hinged):

@@ -6,15 +6,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from xew.protocol import OWN_MOTION, SHARED_MOTION
+from xew.sim_warp.changes.scenes import make_plan, make_scene
 from xew.sim_warp.kinematics.expert import Commands, joint_commands
 from xew.sim_warp.kinematics.forward import tool_poses
 from xew.sim_warp.kinematics.own_motion import own_commands
 from xew.sim_warp.physics import Motion, World, simulate
 from xew.sim_warp.plan import Timeline, ToolPath
-from xew.sim_warp.production.outcome import find_failure
+from xew.sim_warp.production.outcome import find_failure, find_obstruction
 from xew.sim_warp.rendering.observe import Recording, scene_recording
 from xew.sim_warp.robots import ROBOTS, RobotSpec
-from xew.sim_warp.scene import Scene, scene_rng
+from xew.sim_warp.scene import Scene
 from xew.sim_warp.tasks import Task, get_task
 
 
@@ -31,6 +32,8 @@ class Job:
     """Whether another robot has failed; then nothing is rendered."""
     motion: str = SHARED_MOTION
     """Kind of motion, one of `xew.protocol.MOTIONS`."""
+    change: str = ""
+    """The scene's change, as `Record.change`."""
 
 
 @dataclass(frozen=True)
@@ -49,6 +52,8 @@ class Cell:
     """Simulated motion; None before the simulation, or if the robot cannot follow the plan."""
     motion_kind: str = SHARED_MOTION
     """Kind of motion, one of `xew.protocol.MOTIONS`."""
+    change: str = ""
+    """The scene's change, as `Record.change`."""
     tool_pose: np.ndarray | None = None
     """[t 2 7] float32 measured tool poses, xyz [m] and quaternion xyzw, world; None without motion."""
     failure: tuple[str, str] | None = None
@@ -75,8 +80,8 @@ class Cell:
 def plan_cells(jobs: Sequence[Job], robots: Mapping[str, RobotSpec] = ROBOTS, device: str | None = None) -> list[list[Cell]]:
     """Scene, plan and commands of every cell, by job; the commands of all cells of a robot are solved together on a device."""
     tasks = [get_task(job.task) for job in jobs]
-    scenes = [task.sample(scene_rng(job.task, job.seed), job.seed) for job, task in zip(jobs, tasks, strict=True)]
-    plans = [task.plan(scene) for task, scene in zip(tasks, scenes, strict=True)]
+    scenes = [make_scene(task, job.task, job.seed, job.change) for job, task in zip(jobs, tasks, strict=True)]
+    plans = [make_plan(task, scene) for task, scene in zip(tasks, scenes, strict=True)]
     seeds: list[list[Cell]] = [[] for _ in jobs]
     for name, kind in dict.fromkeys((robot, job.motion) for job in jobs for robot in job.robots):
         mine = [index for index, job in enumerate(jobs) if name in job.robots and job.motion == kind]
@@ -84,7 +89,10 @@ def plan_cells(jobs: Sequence[Job], robots: Mapping[str, RobotSpec] = ROBOTS, de
         planned = plan_motion(robot, [plans[index] for index in mine], kind, device)
         for index, (path, commands) in zip(mine, planned, strict=True):
             failure = None if commands.problem is None else ("plan", commands.problem)
-            cell = Cell(jobs[index].task, scenes[index], path, name, robot, commands, motion_kind=kind, failure=failure)
+            job = jobs[index]
+            cell = Cell(
+                job.task, scenes[index], path, name, robot, commands, motion_kind=kind, change=job.change, failure=failure
+            )
             seeds[index].append(cell)
     return seeds
 
@@ -113,7 +121,8 @@ def with_motion(cell: Cell, motion: Motion) -> Cell:
     """A planned cell with its simulated motion and its failure, if any."""
     tools = measured_tools(cell.robot, motion.joint_pos)
     failure = find_failure(cell.task, cell.scene, cell.path, cell.commands.action, motion, tools)
-    return replace(cell, motion=motion, tool_pose=tools, failure=failure)
+    moved = replace(cell, motion=motion, tool_pose=tools, failure=failure)
+    return moved if failure else replace(moved, failure=find_obstruction(moved.scene, moved.recording))
 
 
 def measured_tools(robot: RobotSpec, joint_pos: np.ndarray) -> np.ndarray:

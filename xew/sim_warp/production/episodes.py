@@ -11,7 +11,9 @@ import warp as wp
 import xew
 from xew.config import ConfigError
 from xew.episode import Record, States, read_record, write_episode
-from xew.sim_warp.geometry.camera import HEAD_CAMERA
+from xew.protocol import parse_change
+from xew.sim_warp.changes.looks import camera_of, stage_of
+from xew.sim_warp.geometry.camera import spec_camera
 from xew.sim_warp.production.cells import Cell
 from xew.sim_warp.rendering.observe import Observation, keypoint_names, observe
 from xew.sim_warp.rendering.render import Renderer
@@ -24,9 +26,11 @@ Pixels = tuple[Observation, np.ndarray]
 
 
 def render_cells(cells: Sequence[Cell], renderer: Renderer) -> list[Pixels]:
-    """The camera's observation of each cell, and the robot alone by its commands [t h w 3] uint8."""
-    views = observe(renderer, [cell.recording for cell in cells])
-    renders = command_renders([(cell.robot, cell.commands.action) for cell in cells], renderer=renderer)
+    """The camera's observation of each cell of a scene, and the robot alone by its commands [t h w 3] uint8."""
+    change = parse_change(cells[0].change)
+    camera = spec_camera(camera_of(change))
+    views = observe(renderer, [cell.recording for cell in cells], camera, stage_of(change))
+    renders = command_renders([(cell.robot, cell.commands.action) for cell in cells], camera, renderer)
     return list(zip(views, renders, strict=True))
 
 
@@ -57,6 +61,8 @@ def header(cell: Cell, device: wp.Device) -> Record:
         versions=_versions(),
         device=device.name,
         motion=cell.motion_kind,
+        change=cell.change,
+        camera=camera_of(parse_change(cell.change)),
     )
 
 
@@ -78,6 +84,7 @@ def _versions() -> dict[str, str]:
 
 def _states(cell: Cell, view: Observation) -> States:
     assert cell.tool_pose is not None, "a cell that is rendered has been simulated"
+    camera = spec_camera(camera_of(parse_change(cell.change)))
     return States(
         action=cell.commands.action,
         joint_pos=cell.known_motion.joint_pos,
@@ -90,6 +97,6 @@ def _states(cell: Cell, view: Observation) -> States:
         keypoints=view.keypoints,
         keypoint_visible=view.keypoint_visible,
         robot_mask=view.robot_mask,
-        intrinsics=HEAD_CAMERA.intrinsics,
-        extrinsics=HEAD_CAMERA.extrinsics,
+        intrinsics=camera.intrinsics,
+        extrinsics=camera.extrinsics,
     )

@@ -1,11 +1,16 @@
 """The outcome of a motion: success, or one of `episode.FAILURES` with a sentence."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from xew.protocol import ARMS
+from xew.sim_warp.changes.clutter import find_struck
+from xew.sim_warp.changes.scenes import is_solved
 from xew.sim_warp.physics import Motion
 from xew.sim_warp.physics.plausibility import find_implausible
 from xew.sim_warp.plan import ToolPath
+from xew.sim_warp.rendering.observe import Recording
 from xew.sim_warp.scene import Scene
 from xew.sim_warp.tasks import Moment, Task
 
@@ -33,14 +38,26 @@ def find_failure(
     if motion.arm_overlap > DEEPEST_IN_ARM:
         return "plan", f"the arms pressed {1000 * motion.arm_overlap:.1f} mm into each other"
     first, last = (moment(action, motion, tools, frame) for frame in (0, -1))
-    if task.success(scene, first):
+    if is_solved(task, scene, first):
         return "plan", "the scene is solved before it begins"
-    if not task.success(scene, last):
+    if not is_solved(task, scene, last):
         return _find_lost_hold(scene, path, motion)
     problem = find_implausible(
         scene, path.holds, motion.object_pose, motion.penetration, motion.contact, tools, path.frame_rate
     )
     return ("physics", problem) if problem else None
+
+
+def find_obstruction(scene: Scene, recording: Recording) -> tuple[str, str] | None:
+    """The failure of a motion that comes too near to the scene's clutter, which is not simulated."""
+    if not scene.clutter:
+        return None
+    moving = len(recording.things) - len(scene.clutter)
+    assert recording.thing_pose is not None
+    problem = find_struck(
+        scene.clutter, replace(recording, things=recording.things[:moving], thing_pose=recording.thing_pose[:, :moving])
+    )
+    return ("plan", problem) if problem else None
 
 
 def moment(action: np.ndarray, motion: Motion, tools: np.ndarray, frame: int) -> Moment:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 from xew.episode import EpisodeError, Record
 from xew.protocol import SEED_STARTS, SHARED_MOTION
+from xew.sim_warp.changes.scenes import change_of
 from xew.sim_warp.manifest import Manifest
 from xew.sim_warp.production.cells import Job
 
@@ -31,6 +32,8 @@ class Family:
     """Seeds on which one of the robots is known to fail."""
     motion: str = SHARED_MOTION
     """Kind of motion of new episodes."""
+    change: str = ""
+    """Change of new episodes, or RANDOM_CHANGE."""
     done: dict[int, dict[str, Record]] = field(default_factory=lambda: defaultdict(dict))
 
     def add(self, record: Record) -> None:
@@ -59,7 +62,8 @@ class Family:
             if hopeful == self.wanted:
                 break
             if missing := self._missing_robots(seed):
-                jobs.append(Job(self.task, seed, missing, not self._is_hopeful(seed), self.motion))
+                change = change_of(self.change, self.task, seed)
+                jobs.append(Job(self.task, seed, missing, not self._is_hopeful(seed), self.motion, change))
             hopeful += self._is_hopeful(seed)
         return jobs
 
@@ -80,6 +84,7 @@ def plan_families(
     manifest: Manifest,
     *,
     motion: str = SHARED_MOTION,
+    change: str = "",
     unpaired: bool = False,
 ) -> list[Family]:
     """The families of all tasks: one for all robots, or with `unpaired` one per robot with different seeds.
@@ -94,7 +99,7 @@ def plan_families(
             teams = [(robot,) for robot in robots[name]] if unpaired else [tuple(robots[name])]
             for number, team in enumerate(teams):
                 first_seed = SEED_STARTS[name] + number * SEEDS_OF_ROBOT
-                families.append(Family(task, first_seed, wanted, team, manifest.failing(task, team), motion))
+                families.append(Family(task, first_seed, wanted, team, manifest.failing(task, team), motion, change))
     return families
 
 

@@ -28,4 +28,6 @@ def yield_table(records: Sequence[Record]) -> str:
     for task, accepted in sorted(seeds.items()):
         lines.append(f"{task:<{task_width}} all robots together: {sum(accepted.values())} of {len(accepted)} seeds accepted")
     lines.append("motion: " + ", ".join(f"{motion} {count}" for motion, count in count_motions(records).items()))
+    if changes := Counter(record.change for record in records if record.change):
+        lines.append("changes: " + ", ".join(f"{change} {count}" for change, count in sorted(changes.items())))
     return "\n".join(lines)

@@ -12,6 +12,7 @@ import numpy as np
 
 from xew.config import ConfigError, UntrustedError
 from xew.episode import Record, States, data_folder, read_record, read_states
+from xew.sim_warp.changes.scenes import make_scene
 from xew.sim_warp.embodiment.spec import RobotSpec
 from xew.sim_warp.embodiment.urdf import load_urdf
 from xew.sim_warp.geometry.camera import Camera
@@ -21,7 +22,8 @@ from xew.sim_warp.rendering.observe import scene_recording
 from xew.sim_warp.rendering.streams import default_renderer
 from xew.sim_warp.rendering.surfaces import MOVED, MOVING, SurfaceTracks, track_surfaces
 from xew.sim_warp.robots import recorded_robot
-from xew.sim_warp.scene import Scene, scene_hash, scene_rng
+from xew.sim_warp.scene import Scene, scene_hash
+from xew.sim_warp.stage import Stage
 from xew.sim_warp.tasks import recorded_task
 
 
@@ -46,16 +48,17 @@ class Visibility:
 
 
 def scene_names(scene: Scene) -> tuple[str, ...]:
-    """Names of the bodies of `rendering.observe.scene_things`: the objects, then the lids of hinged objects."""
-    return *scene.names, *(f"{thing.name} lid" for thing in scene.objects if thing.hinge is not None)
+    """Names of the bodies of `rendering.observe.scene_things`: the objects, then the lids of hinged objects, then clutter."""
+    lids = (f"{thing.name} lid" for thing in scene.objects if thing.hinge is not None)
+    return *scene.names, *lids, *(thing.name for thing in scene.clutter)
 
 
 def read_surfaces(folder: Path, keep: Path | None = None) -> SurfaceTracks | None:
     """Surface tracks of an accepted episode, read from or written to the store `keep`, if given.
 
     Returns:
-        None if the shapes are unknown: the episode was imported, its task now makes another scene of its seed, or its task or
-        robot does not exist.
+        None if the shapes are unknown: the episode was imported, its task now makes another scene of its seed, its task or
+        robot does not exist, or several views are tiled into one picture.
 
     Raises:
         EpisodeError: a file is missing or damaged.
@@ -63,7 +66,7 @@ def read_surfaces(folder: Path, keep: Path | None = None) -> SurfaceTracks | Non
     """
     record = read_record(folder)
     try:
-        scene = None if record.source else _find_scene(record)
+        scene = None if record.source or record.camera.parts else _find_scene(record)
         robot = recorded_robot(record.robot, data_folder(folder))
     except UntrustedError:
         raise
@@ -107,12 +110,12 @@ def _render_surfaces(robot: RobotSpec, scene: Scene, states: States) -> SurfaceT
     recording = scene_recording(robot, scene, states.joint_pos, states.object_pose, states.object_joint)
     height, width = states.robot_mask.shape[1:]
     camera = Camera(states.intrinsics, states.extrinsics, width, height)
-    return track_surfaces([recording], [scene_names(scene)], default_renderer(), camera)[0]
+    return track_surfaces([recording], [scene_names(scene)], default_renderer(), camera, Stage(raised=scene.raised))[0]
 
 
 def _find_scene(record: Record) -> Scene | None:
     """The scene of an episode; None if its task now makes another scene of its seed."""
-    scene = recorded_task(record.task).sample(scene_rng(record.task, record.seed), record.seed)
+    scene = make_scene(recorded_task(record.task), record.task, record.seed, record.change)
     return scene if scene.names == record.object_names and scene_hash(scene) == record.scene_hash else None
 
 

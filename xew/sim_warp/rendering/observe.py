@@ -14,6 +14,7 @@ from xew.sim_warp.kinematics.forward import link_poses
 from xew.sim_warp.rendering.bodies import body_names, keypoint_links, nearby_links, robot_bodies, robot_pose
 from xew.sim_warp.rendering.render import Body, Frames, Renderer, World
 from xew.sim_warp.scene import Hinge, Scene
+from xew.sim_warp.stage import STANDARD, Stage
 
 VISIBILITY_MARGIN = 0.02
 """Distance in front of a link's origin beyond which another surface hides the link [m]."""
@@ -46,11 +47,13 @@ class Observation:
     """[t k] bool."""
 
 
-def observe(renderer: Renderer, recordings: Sequence[Recording], camera: Camera = HEAD_CAMERA) -> list[Observation]:
+def observe(
+    renderer: Renderer, recordings: Sequence[Recording], camera: Camera = HEAD_CAMERA, stage: Stage = STANDARD
+) -> list[Observation]:
     """Observe many episodes at once; the result of each does not depend on the others."""
     points = [keypoint_positions(recording.robot, recording.joint_pos) for recording in recordings]
     worlds = [recording_world(recording, at) for recording, at in zip(recordings, points, strict=True)]
-    frames = renderer.render_batch(worlds, camera)
+    frames = renderer.render_batch(worlds, camera, stage=stage)
     return [_observation(*seen, camera) for seen in zip(recordings, points, frames, strict=True)]
 
 
@@ -69,7 +72,7 @@ def scene_recording(
 
 
 def scene_things(scene: Scene, object_pose: np.ndarray, object_joint: np.ndarray) -> tuple[list[Body], np.ndarray]:
-    """The objects of a scene, then their lids, as bodies with poses.
+    """The objects of a scene, then their lids and the clutter, as bodies with poses.
 
     Args:
         object_pose: [t o 7] recorded poses of the objects, xyz [m] and quaternion xyzw, world.
@@ -85,6 +88,9 @@ def scene_things(scene: Scene, object_pose: np.ndarray, object_joint: np.ndarray
             bodies.append(Body(thing.hinge.lid.mesh, is_robot=False))
             swing = _swing(thing.hinge, object_joint[:, index])
             poses.append(pose_from_matrix(matrix_from_pose(object_pose[:, index]) @ swing)[:, None])
+    for thing in scene.clutter:
+        bodies.append(Body(thing.shape.mesh, is_robot=False))
+        poses.append(np.tile(np.array(thing.pose, object_pose.dtype), (len(object_pose), 1, 1)))
     return bodies, np.concatenate(poses, 1)
 
 

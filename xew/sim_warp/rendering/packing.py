@@ -1,7 +1,7 @@
 """Packing of geometry and poses of many worlds into device arrays; worlds with equal meshes share one copy."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 import warp as wp
@@ -41,10 +41,14 @@ class FrameTable:
     """[t] int32 index of the frame's first body in the packed poses."""
     next_pose: np.ndarray
     """[t] int32 the same for the world's next frame; for the last frame its own."""
+    frame: np.ndarray
+    """[t] int32 index of the frame among all frames."""
+    next_frame: np.ndarray
+    """[t] int32 the same of the world's next frame; for the last frame its own."""
 
     def select(self, chunk: slice) -> "FrameTable":
         """Some of the frames."""
-        return FrameTable(self.world[chunk], self.pose[chunk], self.next_pose[chunk])
+        return FrameTable(*(getattr(self, column.name)[chunk] for column in fields(self)))
 
 
 @dataclass(frozen=True)
@@ -139,14 +143,15 @@ def pack_frames(worlds: Sequence[World], kind: Sequence[int]) -> tuple[FrameTabl
 
     `kind` is the index of each world among the distinct worlds.
     """
-    columns: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
-    first = 0
+    columns: list[tuple[np.ndarray, ...]] = []
+    first = begin = 0
     for world, index in zip(worlds, kind, strict=True):
         count, bodies = world.pose.shape[:2]
         frame = np.arange(count)
         after = np.minimum(frame + 1, count - 1)
-        columns.append((np.full(count, index), first + frame * bodies, first + after * bodies))
+        columns.append((np.full(count, index), first + frame * bodies, first + after * bodies, begin + frame, begin + after))
         first += count * bodies
+        begin += count
     poses = _concatenate([np.reshape(world.pose, (-1, 7)) for world in worlds], (7,), np.float32)
     return FrameTable(*(np.concatenate(column).astype(np.int32) for column in zip(*columns, strict=True))), poses
 

@@ -9,7 +9,7 @@ from xew.sim_warp import stage
 from xew.sim_warp.geometry.camera import Camera
 from xew.sim_warp.rendering import raster_kernels as raster
 from xew.sim_warp.rendering import shading_kernels as shading
-from xew.sim_warp.rendering.lighting import SHADOW_SIZE, camera_view, light_of, stage_shading
+from xew.sim_warp.rendering.lighting import SHADOW_SIZE, camera_views, light_of, pack_patterns, stage_shading
 from xew.sim_warp.rendering.packing import Body, FrameTable, PackedGeometry, World, pack_frames, pack_geometry
 
 FLOW_LIMIT = 25.0
@@ -20,6 +20,16 @@ IDENTITY = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 
 @dataclass(frozen=True)
+class Look:
+    """Lights, shading and patterns of a stage as arguments of the kernels."""
+
+    lights: wp.array
+    """[l] raster.Light."""
+    patterns: shading.Patterns
+    shading: shading.Shading
+
+
+@dataclass(frozen=True)
 class Call:
     """Arguments of the renderer for all frames of a call."""
 
@@ -27,9 +37,7 @@ class Call:
     pose: wp.array
     """[P] wp.transform, poses of the bodies of all frames, world."""
     camera: Camera
-    view: raster.View
-    """The camera as an argument of the kernels."""
-    stage: shading.LitStage
+    look: Look
     shadows: int = 0
     """Number of lights with shadow maps."""
     wanted: frozenset[str] = frozenset()
@@ -41,12 +49,16 @@ class Call:
 class Chunk:
     """The frames that are on the device at once."""
 
-    def __init__(self, device: wp.Device, geometry: PackedGeometry, frames: FrameTable) -> None:
+    def __init__(self, device: wp.Device, geometry: PackedGeometry, frames: FrameTable, camera: Camera) -> None:
         self.count = len(frames.world)
         self.vertex_count = int(geometry.vertex_counts[frames.world].max())
         self.triangle_count = int(geometry.triangle_counts[frames.world].max())
         self.world, self.pose, self.next_pose = (
             wp.array(column, dtype=int, device=device) for column in (frames.world, frames.pose, frames.next_pose)
+        )
+        self.cameras, self.next_cameras = (
+            wp.array(camera_views(camera, column), dtype=raster.View, device=device)
+            for column in (frames.frame, frames.next_frame)
         )
 
 
@@ -72,10 +84,13 @@ class Passes:
     def __init__(self, device: wp.Device) -> None:
         self.device = device
         self._stripes = STRIPES["cuda" if device.is_cuda else "cpu"]
-        self._lights = wp.array([light_of(light) for light in stage.LIGHTS], dtype=raster.Light, device=device)
-        self._shading = stage_shading()
         ramp = stage.srgb_from_linear(np.linspace(0, 1, shading.COLORS))
         self._srgb = wp.array(ramp, dtype=wp.uint8, device=device)
+
+    def look(self, shown: stage.Stage) -> Look:
+        """The look of a stage on the device."""
+        lights = wp.array([light_of(light) for light in shown.lights], dtype=raster.Light, device=self.device)
+        return Look(lights, pack_patterns(shown, self.device), stage_shading(shown.ambient))
 
     def draw(self, call: Call, chunk: Chunk) -> Drawn:
         """Visibility of a chunk's frames and, if there are shadows, their shadow maps."""
@@ -90,13 +105,13 @@ class Passes:
         self._launch(
             raster.place_vertices,
             (count, chunk.vertex_count),
-            [call.geometry.arrays, chunk.world, chunk.pose, call.pose, call.view, self._lights],
+            [call.geometry.arrays, chunk.world, chunk.pose, call.pose, chunk.cameras, call.look.lights],
             [drawn.vertex, drawn.shadow_vertex],
         )
         self._launch(
             raster.draw_triangles,
             (count, chunk.triangle_count, self._stripes),
-            [call.geometry.arrays, chunk.world, call.view, drawn.vertex, self._stripes],
+            [call.geometry.arrays, chunk.world, chunk.cameras, drawn.vertex, self._stripes],
             [drawn.key],
         )
         self._launch(
@@ -107,70 +122,71 @@ class Passes:
         )
         return drawn
 
-    def shade(self, call: Call, chunk: Chunk, drawn: Drawn) -> wp.array:
+    def shade(self, call: Call, chunk: Chunk, drawn: Drawn, lit: shading.LitStage) -> wp.array:
         """Colors [t h w 3] uint8 of a chunk's frames."""
         height, width = call.camera.height, call.camera.width
-        posed = [call.geometry.arrays, chunk.world, chunk.pose, call.pose, call.view]
+        posed = [call.geometry.arrays, chunk.world, chunk.pose, call.pose, chunk.cameras]
         seen = [drawn.vertex, drawn.key, drawn.shadow_map, drawn.shadow_tile]
         rgb = self._empty((chunk.count, height, width, 3), wp.uint8)
         self._launch(
             shading.shade_pixels,
             (chunk.count, height, width),
-            [*posed, self._lights, self._shading, call.stage, self._srgb, *seen],
+            [*posed, call.look.lights, call.look.shading, lit, self._srgb, *seen],
             [rgb],
         )
         return rgb
 
-    def measure(self, call: Call, chunk: Chunk, drawn: Drawn) -> dict[str, wp.array]:
+    def measure(self, call: Call, chunk: Chunk, drawn: Drawn, lit: shading.LitStage) -> dict[str, wp.array]:
         """Masks of a chunk's frames and, if requested, bodies, depth [m] (all [t h w]) and optical flow [t h w 2] px."""
         shape = (chunk.count, call.camera.height, call.camera.width)
-        posed = [call.geometry.arrays, chunk.world, chunk.pose, chunk.next_pose, call.pose, call.view]
+        posed = [call.geometry.arrays, chunk.world, chunk.pose, chunk.next_pose, call.pose]
         images = {"robot_mask": self._empty(shape, wp.bool)}
         for name, dtype in (("body", wp.int16), ("depth", wp.float32), ("optical_flow", wp.vec2)):
             images[name] = self._empty(shape if name in call.wanted else (0, 0, 0), dtype)
         self._launch(
             shading.measure_pixels,
             shape,
-            [*posed, call.stage, FLOW_LIMIT, drawn.key],
+            [*posed, chunk.cameras, chunk.next_cameras, lit, FLOW_LIMIT, drawn.key],
             list(images.values()),
         )
         return {name: image for name, image in images.items() if image.size}
 
-    def probe(self, call: Call, chunk: Chunk, drawn: Drawn, pixel: np.ndarray) -> dict[str, wp.array]:
+    def probe(self, call: Call, chunk: Chunk, drawn: Drawn, lit: shading.LitStage, pixel: np.ndarray) -> dict[str, wp.array]:
         """Body [t k] and depth [t k] m that are seen at pixels [t k 2] x y of a chunk's frames."""
         shape = pixel.shape[:2]
         images = {"point_body": self._empty(shape, int), "point_depth": self._empty(shape, float)}
         self._launch(
             shading.probe_pixels,
             shape,
-            [call.geometry.arrays, chunk.world, call.stage, wp.array(pixel, dtype=wp.vec2i, device=self.device), drawn.key],
+            [call.geometry.arrays, chunk.world, lit, wp.array(pixel, dtype=wp.vec2i, device=self.device), drawn.key],
             list(images.values()),
         )
         return images
 
-    def light_stage(self, camera: Camera, ground: bool) -> shading.LitStage:
-        """The lit stage in the view of a camera; empty without a ground."""
-        bodies = [Body(stage.stage_mesh(), False)] if ground else []
-        table, pose = pack_frames([World(bodies, np.tile(IDENTITY, (1, len(bodies), 1)))], [0])
+    def light_stage(self, camera: Camera, shown: stage.Stage | None, look: Look) -> shading.LitStage:
+        """A stage with its look in the view of a camera, or in each view of one that moves; empty without a stage."""
+        bodies = [] if shown is None else [Body(stage.stage_mesh(shown), False)]
+        views = len(camera.extrinsics) if camera.moves else 1
+        table, pose = pack_frames([World(bodies, np.tile(IDENTITY, (views, len(bodies), 1)))], [0])
         call = Call(
             geometry=pack_geometry([bodies], self.device),
             pose=wp.array(pose, dtype=wp.transform, device=self.device),
             camera=camera,
-            view=camera_view(camera),
-            stage=shading.LitStage(),
+            look=look,
         )
-        chunk = Chunk(self.device, call.geometry, table)
+        chunk = Chunk(self.device, call.geometry, table, camera)
         drawn = self.draw(call, chunk)
-        height, width, lights = camera.height, camera.width, len(stage.LIGHTS) if ground else 0
+        height, width, lights = camera.height, camera.width, 0 if shown is None else len(shown.lights)
+        lighting = [look.lights, look.shading, drawn.vertex, drawn.key, wp.vec3(*stage.SKY), look.patterns]
         lit = shading.LitStage()
-        lit.key = drawn.key[0]
-        lit.ambient = self._zeros((height, width), wp.vec3)
-        lit.direct = self._zeros((lights, height, width), wp.vec3)
-        lit.shadow_texel = self._zeros((lights, height, width), wp.vec3)
+        lit.key = drawn.key
+        lit.ambient = self._zeros((views, height, width), wp.vec3)
+        lit.direct = self._zeros((views, lights, height, width), wp.vec3)
+        lit.shadow_texel = self._zeros((views, lights, height, width), wp.vec3)
         self._launch(
             shading.light_stage,
-            (height, width),
-            [call.geometry.arrays, call.view, self._lights, self._shading, drawn.vertex, drawn.key, wp.vec3(*stage.SKY)],
+            (views, height, width),
+            [call.geometry.arrays, chunk.cameras, *lighting],
             [lit.ambient, lit.direct, lit.shadow_texel],
         )
         return lit

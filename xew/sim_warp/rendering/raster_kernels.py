@@ -20,7 +20,9 @@ import warp as wp
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 NEAR = wp.constant(0.1)
-"""Near plane of the camera [m]; triangles are cut there."""
+"""Near plane of lights and of cameras that stand still [m]."""
+NEAR_OF_MOVING = 0.02
+"""Near plane of cameras that move with the robot, close to its hand [m]."""
 SAMPLES = wp.constant(5)
 """Number of samples of a pixel: four of a rotated square make the color, the fifth at its center makes mask, depth, flow
 and body."""
@@ -42,6 +44,7 @@ class View:
     translation: wp.vec3  # m
     focal: wp.vec2  # focal lengths [pixels], or pixels a meter where the view is parallel
     center: wp.vec2  # principal point [pixels]
+    near: float  # near plane of a camera [m]; triangles are cut there
     parallel: int  # 1 for a directional light, else 0
 
 
@@ -52,7 +55,7 @@ class Light:
     view: View
     position: wp.vec3  # m, world
     to_light: wp.vec3  # unit vector, world
-    intensity: float  # of a near light at a distance of 1 m
+    intensity: wp.vec3  # linear RGB, of a near light at a distance of 1 m
 
 
 @wp.struct
@@ -72,6 +75,12 @@ class Geometry:
 
 
 # ---- from the world to the screen
+
+
+@wp.func
+def view_of(views: wp.array(dtype=View), frame: int) -> View:
+    """The camera at a frame of the chunk; a camera that stands still has one view for all."""
+    return views[wp.min(frame, views.shape[0] - 1)]
 
 
 @wp.func
@@ -97,7 +106,7 @@ def place_vertices(
     frame_world: wp.array(dtype=int),  # [n] int32 index of the frame's world among the distinct worlds
     frame_pose: wp.array(dtype=int),  # [n] int32 index into `pose` of the frame's first body
     pose: wp.array(dtype=wp.transform),  # [P 7] float32 xyz [m] and quaternion xyzw of bodies, world
-    camera: View,
+    cameras: wp.array(dtype=View),  # [n] or [1], see `view_of`
     lights: wp.array(dtype=Light),  # [l] lights with the views of their shadow maps
     # Out:
     vertex_out: wp.array2d(dtype=wp.vec3),  # [n v 3] float32 m, camera's frame
@@ -111,7 +120,7 @@ def place_vertices(
     packed = owned[0] + vertex
     body_pose = pose[frame_pose[frame] + geometry.vertex_body[packed]]
     world = wp.transform_point(body_pose, geometry.vertex[packed])
-    vertex_out[frame, vertex] = to_view(camera, world)
+    vertex_out[frame, vertex] = to_view(view_of(cameras, frame), world)
     for i in range(shadow_vertex_out.shape[1]):
         view = lights[i].view
         seen = to_view(view, world)
@@ -210,9 +219,9 @@ def draw(
 
 
 @wp.func
-def cut(behind: wp.vec3, front: wp.vec3) -> wp.vec3:
+def cut(behind: wp.vec3, front: wp.vec3, near: float) -> wp.vec3:
     """Where an edge of the camera's frame meets the near plane."""
-    return behind + (front - behind) * ((NEAR - behind[2]) / (front[2] - behind[2]))
+    return behind + (front - behind) * ((near - behind[2]) / (front[2] - behind[2]))
 
 
 @wp.func
@@ -228,15 +237,15 @@ def draw_cut(
     key_out: wp.array4d(dtype=wp.uint64),  # [n s h w] uint64
 ):
     """Draw what lies beyond the near plane of a triangle of which `a` alone is on its side of the plane."""
-    if a[2] < NEAR:
-        ab = to_screen(camera, cut(a, b))
-        ac = to_screen(camera, cut(a, c))
+    if a[2] < camera.near:
+        ab = to_screen(camera, cut(a, b, camera.near))
+        ac = to_screen(camera, cut(a, c, camera.near))
         sb = to_screen(camera, b)
         draw(ab, sb, to_screen(camera, c), triangle, frame, stripe, stripes, key_out)
         draw(ab, to_screen(camera, c), ac, triangle, frame, stripe, stripes, key_out)
     else:
-        ab = to_screen(camera, cut(b, a))
-        ac = to_screen(camera, cut(c, a))
+        ab = to_screen(camera, cut(b, a, camera.near))
+        ac = to_screen(camera, cut(c, a, camera.near))
         draw(to_screen(camera, a), ab, ac, triangle, frame, stripe, stripes, key_out)
 
 
@@ -245,7 +254,7 @@ def draw_triangles(
     # In:
     geometry: Geometry,
     frame_world: wp.array(dtype=int),  # [n] int32 index of the frame's world among the distinct worlds
-    camera: View,
+    cameras: wp.array(dtype=View),  # [n] or [1], see `view_of`
     vertex_in: wp.array2d(dtype=wp.vec3),  # [n v 3] float32 m, camera's frame
     stripes: int,  # threads that share the rows of a triangle
     # Out:
@@ -262,9 +271,10 @@ def draw_triangles(
     c = vertex_in[frame, corner[2]]
     if wp.dot(wp.cross(b - a, c - a), a) >= 0.0:
         return
-    near_a = a[2] < NEAR
-    near_b = b[2] < NEAR
-    near_c = c[2] < NEAR
+    camera = view_of(cameras, frame)
+    near_a = a[2] < camera.near
+    near_b = b[2] < camera.near
+    near_c = c[2] < camera.near
     if near_a and near_b and near_c:
         return
     if near_a == near_b and near_b == near_c:

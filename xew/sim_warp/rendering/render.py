@@ -5,17 +5,16 @@ frames for passes.py and joins their images. CPU and GPU run the same kernels, a
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import warp as wp
 
 from xew.concurrency import PARSING
-from xew.sim_warp import stage
+from xew.episode import HEIGHT, WIDTH
 from xew.sim_warp.devices.waiting import wait_for
 from xew.sim_warp.geometry.camera import HEAD_CAMERA, Camera, project
 from xew.sim_warp.rendering import shading_kernels as shading
-from xew.sim_warp.rendering.lighting import camera_view
 from xew.sim_warp.rendering.packing import (
     Body,
     FrameTable,
@@ -26,14 +25,17 @@ from xew.sim_warp.rendering.packing import (
     pack_geometry,
     pack_points,
 )
-from xew.sim_warp.rendering.passes import FLOW_LIMIT, Call, Chunk, Passes
+from xew.sim_warp.rendering.passes import FLOW_LIMIT, Call, Chunk, Look, Passes
+from xew.sim_warp.stage import STANDARD, Stage
 
 __all__ = ["FLOW_LIMIT", "Body", "Frames", "Renderer", "World"]
 
 FRAMES_PER_CHUNK = {"cpu": 4, "cuda": 512}
-"""Number of frames on the device at once, about 6 MB each."""
+"""Number of frames of 320x240 pixels on the device at once, about 6 MB each; 16 MB where the camera moves."""
+MOVING_COST = 3
+"""Memory of a frame of a camera that moves, relative to one that stands still: the lit stage is the frame's own."""
 STAGES_KEPT = 16
-"""Number of cameras with a cached lit stage, about 10 MB each."""
+"""Number of cameras and stages with a cached lit stage, about 10 MB each."""
 
 
 def _nothing() -> np.ndarray:
@@ -75,7 +77,8 @@ class Renderer:
         self._frames_per_chunk = frames_per_chunk or FRAMES_PER_CHUNK[kind]
         self._passes = Passes(self.device)
         self._pinned = wp.empty(0, dtype=wp.uint8, device="cpu")
-        self._stages: dict[tuple[bytes, int, int], shading.LitStage] = {}
+        self._looks: dict[Stage, Look] = {}
+        self._stages: dict[tuple[bytes, int, int, Stage | None], shading.LitStage] = {}
 
     def render(
         self,
@@ -99,67 +102,79 @@ class Renderer:
         camera: Camera = HEAD_CAMERA,
         ground: bool = True,
         *,
+        stage: Stage = STANDARD,
         depth: bool = False,
         body: bool = False,
         optical_flow: bool = False,
+        colors: bool = True,
     ) -> list[Frames]:
         """Render worlds of any length and content.
 
         Args:
+            camera: of all worlds; one that moves has a pose for each frame of all worlds, in order.
             ground: True for table, wall, ground and shadows; False for the bodies alone on white, without shadows.
+            stage: table, wall, ground and lights of all worlds; without the ground the light is the standard one.
             depth, body, optical_flow: requests for the optional images of `Frames`.
+            colors: whether to make `rgb`.
 
         Raises:
             ValueError: poses or points do not fit, or are not finite.
         """
-        for world in worlds:
-            check_world(world)
+        check_worlds(worlds, camera)
         if not worlds:
             return []
         optional = {"depth": depth, "body": body, "optical_flow": optical_flow}
         wanted = frozenset(name for name, asked_for in optional.items() if asked_for)
         with PARSING:  # threads share the device's buffers and modules
-            return _split_by_world(self._render_worlds(worlds, camera, ground, wanted), worlds)
+            images = self._render_worlds(worlds, camera, stage if ground else None, wanted, colors)
+            return _split_by_world(images, worlds)
 
-    def probe_batch(self, worlds: Sequence[World], camera: Camera = HEAD_CAMERA) -> list[Frames]:
+    def probe_batch(self, worlds: Sequence[World], camera: Camera = HEAD_CAMERA, stage: Stage = STANDARD) -> list[Frames]:
         """As `render_batch` with stage, bodies and depth, but without `rgb`, for worlds with points.
 
         Raises:
             ValueError: poses or points do not fit, or are not finite, or a world has no points.
         """
+        check_worlds(worlds, camera)
         for world in worlds:
-            check_world(world)
             if world.points is None or not world.points.shape[1]:
                 raise ValueError("a world has no points to look up; give World.points [t k 3].")
         if not worlds:
             return []
         with PARSING:
-            images = self._render_worlds(worlds, camera, True, frozenset({"body", "depth"}), colors=False)
+            images = self._render_worlds(worlds, camera, stage, frozenset({"body", "depth"}), colors=False)
             return _split_by_world(images, worlds)
 
     def _render_worlds(
-        self, worlds: Sequence[World], camera: Camera, ground: bool, wanted: frozenset[str], colors: bool = True
+        self, worlds: Sequence[World], camera: Camera, stage: Stage | None, wanted: frozenset[str], colors: bool = True
     ) -> dict[str, np.ndarray]:
         """Images of all frames of all worlds on the host, by the names of `Frames`; colors, with shadows, if asked for."""
         kinds, kind = distinct_worlds(worlds)
         table, pose = pack_frames(worlds, kind)
+        look = self._look(stage or STANDARD)
         call = Call(
             geometry=pack_geometry(kinds, self.device),
             pose=wp.array(pose, dtype=wp.transform, device=self.device),
             camera=camera,
-            view=camera_view(camera),
-            stage=self._stage(camera, ground),
-            shadows=len(stage.LIGHTS) if ground and colors else 0,
+            look=look,
+            shadows=len(stage.lights) if stage and colors else 0,
             wanted=wanted,
             colors=colors,
         )
         pixel = nearest_pixel(camera, pack_points(worlds))
-        chunks = [slice(i, i + self._frames_per_chunk) for i in range(0, len(table.world), self._frames_per_chunk)]
+        count = self._chunk_size(camera)
         host: dict[str, np.ndarray] = {}
-        for chunk in chunks:
-            for name, image in self._render_chunk(call, table.select(chunk), pixel[chunk]).items():
+        for chunk in (slice(i, i + count) for i in range(0, len(table.world), count)):
+            at_chunk = replace(camera, extrinsics=camera.extrinsics[chunk]) if camera.moves else camera
+            lit = self._stage(at_chunk, stage, look)
+            for name, image in self._render_chunk(call, table.select(chunk), lit, pixel[chunk]).items():
                 self._fetch(image, host, name, chunk, len(table.world))
         return host
+
+    def _chunk_size(self, camera: Camera) -> int:
+        """Number of a camera's frames on the device at once: in memory as many as `frames_per_chunk` of the head camera."""
+        cost = camera.width * camera.height / (WIDTH * HEIGHT) * (MOVING_COST if camera.moves else 1)
+        return max(1, int(self._frames_per_chunk / cost))
 
     def _fetch(self, image: wp.array, host: dict[str, np.ndarray], name: str, chunk: slice, count: int) -> None:
         """Copy a chunk's image to its place among all frames; from a GPU by pinned memory, which is forty times as fast."""
@@ -176,25 +191,46 @@ class Renderer:
             host[name] = np.empty((count, *values.shape[1:]), values.dtype)
         host[name][chunk] = values
 
-    def _render_chunk(self, call: Call, frames: FrameTable, pixel: np.ndarray) -> dict[str, wp.array]:
+    def _render_chunk(self, call: Call, frames: FrameTable, lit: shading.LitStage, pixel: np.ndarray) -> dict[str, wp.array]:
         """Images of some frames on the device, by the names of `Frames`."""
-        passes, chunk = self._passes, Chunk(self.device, call.geometry, frames)
+        passes, chunk = self._passes, Chunk(self.device, call.geometry, frames, call.camera)
         drawn = passes.draw(call, chunk)
-        images = {"rgb": passes.shade(call, chunk, drawn)} if call.colors else {}
-        images |= passes.measure(call, chunk, drawn)
+        images = {"rgb": passes.shade(call, chunk, drawn, lit)} if call.colors else {}
+        images |= passes.measure(call, chunk, drawn, lit)
         if pixel.shape[1]:
-            images |= passes.probe(call, chunk, drawn, pixel)
+            images |= passes.probe(call, chunk, drawn, lit, pixel)
         return images
 
-    def _stage(self, camera: Camera, ground: bool) -> shading.LitStage:
-        """The lit stage of a camera, cached; without a ground one entry serves all cameras of a size."""
-        view = camera.intrinsics.tobytes() + camera.extrinsics.tobytes() if ground else b""
-        key = (view, camera.width, camera.height)
+    def _look(self, stage: Stage) -> Look:
+        """Lights, shading and patterns of a stage, cached."""
+        if stage not in self._looks:
+            if len(self._looks) >= STAGES_KEPT:
+                self._looks.clear()
+            self._looks[stage] = self._passes.look(stage)
+        return self._looks[stage]
+
+    def _stage(self, camera: Camera, stage: Stage | None, look: Look) -> shading.LitStage:
+        """The lit stage of a camera, cached if it stands still; without a stage one entry serves all cameras of a size."""
+        if camera.moves and stage:
+            return self._passes.light_stage(camera, stage, look)
+        if camera.moves:
+            camera = replace(camera, extrinsics=camera.extrinsics[0])
+        view = camera.intrinsics.tobytes() + camera.extrinsics.tobytes() if stage else b""
+        key = (view, camera.width, camera.height, stage)
         if key not in self._stages:
             if len(self._stages) >= STAGES_KEPT:
                 self._stages.clear()
-            self._stages[key] = self._passes.light_stage(camera, ground)
+            self._stages[key] = self._passes.light_stage(camera, stage, look)
         return self._stages[key]
+
+
+def check_worlds(worlds: Sequence[World], camera: Camera) -> None:
+    """Raise ValueError as `check_world`, or if the camera does not have a pose for each frame."""
+    for world in worlds:
+        check_world(world)
+    frames = sum(len(world.pose) for world in worlds)
+    if camera.moves and len(camera.extrinsics) != frames:
+        raise ValueError(f"the camera has {len(camera.extrinsics)} poses, expected one for each of the {frames} frames.")
 
 
 def _split_by_world(images: dict[str, np.ndarray], worlds: Sequence[World]) -> list[Frames]:

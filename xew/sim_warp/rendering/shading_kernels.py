@@ -15,7 +15,6 @@ import warp as wp
 
 from xew.sim_warp.rendering.raster_kernels import (
     CENTER,
-    NEAR,
     OFFSET_X,
     OFFSET_Y,
     SAMPLES,
@@ -27,6 +26,7 @@ from xew.sim_warp.rendering.raster_kernels import (
     to_screen,
     to_view,
     vec5,
+    view_of,
 )
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})  # why: see raster_kernels.py
@@ -51,12 +51,24 @@ class Shading:
 
 @wp.struct
 class LitStage:
-    """The static stage in one camera's view: keys of its samples and, per pixel, its light without shadows."""
+    """The static stage in a camera's view: keys of its samples and, per pixel, its light without shadows.
 
-    key: wp.array3d(dtype=wp.uint64)  # [s h w] uint64
-    ambient: wp.array2d(dtype=wp.vec3)  # [h w 3] float32 linear RGB
-    direct: wp.array3d(dtype=wp.vec3)  # [l h w 3] float32 linear RGB, by light
-    shadow_texel: wp.array3d(dtype=wp.vec3)  # [l h w 3] float32 x y [texels] and nearness of the pixel's center
+    The views u are one for a camera that stands still, and one for each frame of the chunk for one that moves.
+    """
+
+    key: wp.array4d(dtype=wp.uint64)  # [u s h w] uint64
+    ambient: wp.array3d(dtype=wp.vec3)  # [u h w 3] float32 linear RGB
+    direct: wp.array4d(dtype=wp.vec3)  # [u l h w 3] float32 linear RGB, by light
+    shadow_texel: wp.array4d(dtype=wp.vec3)  # [u l h w 3] float32 x y [texels] and nearness of the pixel's center
+
+
+@wp.struct
+class Patterns:
+    """Periodic images on surfaces of the stage."""
+
+    image: wp.array3d(dtype=wp.vec3)  # [x m m 3] float32 linear RGB
+    period: wp.array(dtype=float)  # [x] float32 m, side of each image on its surface
+    of_triangle: wp.array(dtype=int)  # [f] int32 index of a triangle's image, -1 for its plain color
 
 
 # ---- shadows
@@ -154,6 +166,39 @@ def surface_at(
 
 
 @wp.func
+def pattern_at(image: wp.array2d(dtype=wp.vec3), u: float, v: float) -> wp.vec3:
+    """The color of a periodic image at u to the right and v upward, in pixels, with bilinear weights."""
+    size = float(image.shape[0])
+    x = u - wp.floor(u / size) * size
+    y = v - wp.floor(v / size) * size
+    left = wp.min(int(x), image.shape[1] - 1)
+    low = wp.min(int(y), image.shape[0] - 1)
+    right = (left + 1) % image.shape[1]
+    high = (low + 1) % image.shape[0]
+    fx = x - float(left)
+    fy = y - float(low)
+    below = image[low, left] * (1.0 - fx) + image[low, right] * fx
+    above = image[high, left] * (1.0 - fx) + image[high, right] * fx
+    return below * (1.0 - fy) + above * fy
+
+
+@wp.func
+def stage_albedo(patterns: Patterns, triangle: int, surface: Surface) -> wp.vec3:
+    """The color of a point of the stage: linear RGB."""
+    pattern = patterns.of_triangle[triangle]
+    if pattern < 0:
+        return surface.albedo
+    image = patterns.image[pattern]
+    scale = float(image.shape[0]) / patterns.period[pattern]
+    point = surface.point * scale
+    if wp.abs(surface.normal[2]) > 0.5:
+        return pattern_at(image, point[0], point[1])
+    if wp.abs(surface.normal[1]) > 0.5:
+        return pattern_at(image, point[0], point[2])
+    return pattern_at(image, point[1], point[2])
+
+
+@wp.func
 def ambient_light(surface: Surface, shading: Shading) -> wp.vec3:
     """Light from everywhere, less of it on what faces down: linear RGB."""
     strength = shading.ambient * (1.0 - shading.sky_share * 0.5 * (1.0 - surface.normal[2]))
@@ -179,7 +224,7 @@ def direct_light(surface: Surface, light: Light, shading: Shading) -> wp.vec3:
     shine = shine * shine
     shine = shine * shine
     gloss = shading.specular * shine * shine
-    return (surface.albedo * facing + wp.vec3(gloss, gloss, gloss)) * (intensity * shading.exposure)
+    return wp.cw_mul(surface.albedo * facing + wp.vec3(gloss, gloss, gloss), intensity * shading.exposure)
 
 
 @wp.func
@@ -226,37 +271,40 @@ def owner(key: wp.uint64, stage_key: wp.uint64) -> int:
 def light_stage(
     # In:
     geometry: Geometry,
-    camera: View,
+    cameras: wp.array(dtype=View),  # [u]
     lights: wp.array(dtype=Light),  # [l] lights with the views of their shadow maps
     shading: Shading,
-    vertex_in: wp.array2d(dtype=wp.vec3),  # [1 v 3] float32 m, camera's frame
-    key_in: wp.array4d(dtype=wp.uint64),  # [1 s h w] uint64, see `draw_triangles`
+    vertex_in: wp.array2d(dtype=wp.vec3),  # [u v 3] float32 m, camera's frame
+    key_in: wp.array4d(dtype=wp.uint64),  # [u s h w] uint64, see `draw_triangles`
     sky: wp.vec3,  # linear RGB where nothing is
+    patterns: Patterns,
     # Out:
-    ambient_out: wp.array2d(dtype=wp.vec3),  # [h w 3] float32 linear RGB
-    direct_out: wp.array3d(dtype=wp.vec3),  # [l h w 3] float32 linear RGB, without shadows
-    shadow_texel_out: wp.array3d(dtype=wp.vec3),  # [l h w 3] float32 x y [texels] and nearness on each shadow map
+    ambient_out: wp.array3d(dtype=wp.vec3),  # [u h w 3] float32 linear RGB
+    direct_out: wp.array4d(dtype=wp.vec3),  # [u l h w 3] float32 linear RGB, without shadows
+    shadow_texel_out: wp.array4d(dtype=wp.vec3),  # [u l h w 3] float32 x y [texels] and nearness on each shadow map
 ):
-    """Light the stage once per camera, by source; frames multiply it with their shadows."""
-    row, column = wp.tid()
+    """Light the stage once per view, by source; frames multiply it with their shadows."""
+    u, row, column = wp.tid()
+    camera = cameras[u]
     ambient = wp.vec3(0.0, 0.0, 0.0)
     for sample in range(SAMPLES):
-        triangle = owner(key_in[0, sample, row, column], wp.uint64(0))
+        triangle = owner(key_in[u, sample, row, column], wp.uint64(0))
         if triangle < 0:
             if sample != CENTER:
                 ambient += sky * 0.25
         else:
             ray = pixel_ray(camera, float(column) + OFFSET_X[sample], float(row) + OFFSET_Y[sample])
-            seen = ray / nearness_of(key_in[0, sample, row, column])
-            surface = surface_at(geometry, triangle, wp.transform_identity(), camera, seen, 0, vertex_in)
+            seen = ray / nearness_of(key_in[u, sample, row, column])
+            surface = surface_at(geometry, triangle, wp.transform_identity(), camera, seen, u, vertex_in)
+            surface.albedo = stage_albedo(patterns, triangle, surface)
             if sample != CENTER:
                 ambient += ambient_light(surface, shading) * 0.25
-            for i in range(direct_out.shape[0]):
+            for i in range(direct_out.shape[1]):
                 if sample == CENTER:
-                    shadow_texel_out[i, row, column] = to_screen(lights[i].view, to_view(lights[i].view, surface.point))
+                    shadow_texel_out[u, i, row, column] = to_screen(lights[i].view, to_view(lights[i].view, surface.point))
                 else:
-                    direct_out[i, row, column] += direct_light(surface, lights[i], shading) * 0.25
-    ambient_out[row, column] = ambient
+                    direct_out[u, i, row, column] += direct_light(surface, lights[i], shading) * 0.25
+    ambient_out[u, row, column] = ambient
 
 
 # ---- from visibility to images
@@ -272,6 +320,12 @@ def to_srgb(
 
 
 @wp.func
+def stage_key_of(stage: LitStage, frame: int, sample: int, row: int, column: int) -> wp.uint64:
+    """The stage's key at a sample of a frame."""
+    return stage.key[wp.min(frame, stage.key.shape[0] - 1), sample, row, column]
+
+
+@wp.func
 def stage_light(
     stage: LitStage,
     lights: wp.array(dtype=Light),  # [l]
@@ -283,15 +337,16 @@ def stage_light(
     tile_in: wp.array4d(dtype=wp.uint32),  # [n l q q] uint32 bits of nearness
 ) -> wp.vec3:
     """Light of the stage in a pixel, with a frame's shadows: linear RGB."""
-    total = stage.ambient[row, column]
-    if stage.direct.shape[0] == 0:
+    u = wp.min(frame, stage.key.shape[0] - 1)
+    total = stage.ambient[u, row, column]
+    if stage.direct.shape[1] == 0:
         return total
-    for i in range(stage.direct.shape[0]):
+    for i in range(stage.direct.shape[1]):
         share = 1.0
         if map_in.shape[1] > 0:
-            texel = stage.shadow_texel[i, row, column]
+            texel = stage.shadow_texel[u, i, row, column]
             share = lit_share(texel, shadow_reach(texel, lights[i].view.parallel), frame, i, map_in, tile_in)
-        total += stage.direct[i, row, column] * share
+        total += stage.direct[u, i, row, column] * share
     return compress_highlights(total, shading)
 
 
@@ -332,7 +387,7 @@ def shade_pixels(
     frame_world: wp.array(dtype=int),  # [n] int32 index of the frame's world among the distinct worlds
     frame_pose: wp.array(dtype=int),  # [n] int32 index into `pose` of the frame's first body
     pose: wp.array(dtype=wp.transform),  # [P 7] float32 xyz [m] and quaternion xyzw of bodies, world
-    camera: View,
+    cameras: wp.array(dtype=View),  # [n] or [1], see `view_of`
     lights: wp.array(dtype=Light),  # [l] lights with the views of their shadow maps
     shading: Shading,
     stage: LitStage,
@@ -353,10 +408,11 @@ def shade_pixels(
         for channel in range(3):
             rgb_out[frame, row, column, channel] = to_srgb(plain[channel], srgb)
         return
+    camera = view_of(cameras, frame)
     first_triangle = geometry.triangle_range[frame_world[frame]][0]
     shown = wp.vec4i(-1, -1, -1, -1)
     for s in range(4):
-        shown[s] = owner(key_in[frame, s, row, column], stage.key[s, row, column])
+        shown[s] = owner(key_in[frame, s, row, column], stage_key_of(stage, frame, s, row, column))
     total = wp.vec3(0.0, 0.0, 0.0)
     for s in range(4):
         triangle = shown[s]
@@ -387,10 +443,10 @@ def carry_point(from_pose: wp.transform, to_pose: wp.transform, point: wp.vec3) 
 
 
 @wp.func
-def screen_motion(camera: View, seen: wp.vec3, after: wp.vec3, limit: float) -> wp.vec2:
-    """Motion in pixels between two points of the camera's frame, no longer than `limit`."""
+def screen_motion(camera: View, seen: wp.vec3, next_camera: View, after: wp.vec3, limit: float) -> wp.vec2:
+    """Motion in pixels between a point of the camera's frame and one of the next camera's frame, no longer than `limit`."""
     now = to_screen(camera, seen)
-    later = to_screen(camera, wp.vec3(after[0], after[1], wp.max(after[2], NEAR)))
+    later = to_screen(next_camera, wp.vec3(after[0], after[1], wp.max(after[2], next_camera.near)))
     motion = wp.vec2(later[0] - now[0], later[1] - now[1])
     length = wp.length(motion)
     if length > limit:
@@ -406,7 +462,8 @@ def measure_pixels(
     frame_pose: wp.array(dtype=int),  # [n] int32 index into `pose` of the frame's first body
     frame_next_pose: wp.array(dtype=int),  # [n] int32 the same of the episode's next frame
     pose: wp.array(dtype=wp.transform),  # [P 7] float32 xyz [m] and quaternion xyzw of bodies, world
-    camera: View,
+    cameras: wp.array(dtype=View),  # [n] or [1], see `view_of`
+    next_cameras: wp.array(dtype=View),  # [n] or [1], the same of the episode's next frame
     stage: LitStage,
     flow_limit: float,  # longest optical flow [pixels]
     key_in: wp.array4d(dtype=wp.uint64),  # [n s h w] uint64, see `draw_triangles`
@@ -422,17 +479,19 @@ def measure_pixels(
     body = -1
     robot = 0
     flow = wp.vec2(0.0, 0.0)
-    stage_key = stage.key[CENTER, row, column]
+    stage_key = stage_key_of(stage, frame, CENTER, row, column)
     key = wp.max(key_in[frame, CENTER, row, column], stage_key)
     triangle = owner(key, stage_key)
     if triangle >= 0:
         body = geometry.triangle_body[geometry.triangle_range[world][0] + triangle]
         robot = geometry.body_is_robot[geometry.body_first[world] + body]
         if flow_out.shape[0] > 0 and robot == 1 and frame_next_pose[frame] != frame_pose[frame]:
+            camera = view_of(cameras, frame)
+            next_camera = view_of(next_cameras, frame)
             seen = pixel_ray(camera, float(column), float(row)) / nearness_of(key)
             point = wp.transpose(camera.rotation) * (seen - camera.translation)
             after = carry_point(pose[frame_pose[frame] + body], pose[frame_next_pose[frame] + body], point)
-            flow = screen_motion(camera, seen, to_view(camera, after), flow_limit)
+            flow = screen_motion(camera, seen, next_camera, to_view(next_camera, after), flow_limit)
     mask_out[frame, row, column] = robot == 1
     if body_out.shape[0] > 0:
         body_out[frame, row, column] = wp.int16(body)
@@ -462,7 +521,7 @@ def probe_pixels(
         body_out[frame, k] = -2
         depth_out[frame, k] = 0.0
         return
-    stage_key = stage.key[CENTER, row, column]
+    stage_key = stage_key_of(stage, frame, CENTER, row, column)
     key = wp.max(key_in[frame, CENTER, row, column], stage_key)
     triangle = owner(key, stage_key)
     body_out[frame, k] = -1

@@ -19,6 +19,7 @@ from xew.sim_warp.geometry.surface_points import sample_surface
 from xew.sim_warp.rendering.bodies import SIDES, body_names, robot_bodies
 from xew.sim_warp.rendering.observe import Recording, recording_world
 from xew.sim_warp.rendering.render import Frames, Renderer, nearest_pixel
+from xew.sim_warp.stage import STANDARD, Stage
 
 LINK_CANDIDATES, THING_CANDIDATES = 64, 256
 """Numbers of sampled points on each moving link, and on each object and hinged lid."""
@@ -114,17 +115,29 @@ class _Seen:
 
 
 def track_surfaces(
-    recordings: Sequence[Recording], thing_names: Sequence[Sequence[str]], renderer: Renderer, camera: Camera = HEAD_CAMERA
+    recordings: Sequence[Recording],
+    thing_names: Sequence[Sequence[str]],
+    renderer: Renderer,
+    camera: Camera = HEAD_CAMERA,
+    stage: Stage = STANDARD,
 ) -> list[SurfaceTracks]:
     """Tracks of many episodes at once, with the names of each recording's things; results do not depend on the batch."""
     worlds = [recording_world(recording) for recording in recordings]
     placed = [_place(_candidates(recording), world.pose) for recording, world in zip(recordings, worlds, strict=True)]
     worlds = [replace(world, points=points.xyz) for world, points in zip(worlds, placed, strict=True)]
-    seen = renderer.probe_batch(worlds, camera)
+    seen = renderer.probe_batch(worlds, camera, stage)
     return [
         _tracks(_View(recording, world.pose, shown, camera), names, points)
         for recording, names, world, points, shown in zip(recordings, thing_names, worlds, placed, seen, strict=True)
     ]
+
+
+def surface_points(recording: Recording) -> np.ndarray:
+    """[n 3] m, world: dense points on the robot's moving links and on all things, at all frames."""
+    pose = recording_world(recording).pose
+    things = [_Points(*sample_surface(thing.mesh, DENSE_THING_CANDIDATES)) for thing in recording.things]
+    points = [*robot_points(recording.robot, DENSE_LINK_CANDIDATES), *things]
+    return np.concatenate([_place({body: some}, pose).xyz.reshape(-1, 3) for body, some in enumerate(points)])
 
 
 def _candidates(recording: Recording) -> dict[int, _Points]:
@@ -185,7 +198,7 @@ def _tracks(view: _View, thing_names: Sequence[str], placed: _Placed) -> Surface
 def _see(camera: Camera, placed: _Placed, body: np.ndarray, depth: np.ndarray, least_facing: float) -> _Seen:
     """Points in the image; visible are those that face the camera where the buffer has their body and depth, both [t p]."""
     pixels, own_depth = project(camera, placed.xyz)
-    to_camera = camera.position - placed.xyz
+    to_camera = camera.position[..., None, :] - placed.xyz
     facing = np.einsum("tpi,tpi->tp", placed.normal, to_camera) > least_facing * np.linalg.norm(to_camera, axis=-1)
     near = (own_depth > 0) & (np.abs(depth - own_depth) < DEPTH_MARGIN)
     return _Seen(pixels, (body == placed.body) & facing & near, placed.body)

@@ -20,6 +20,8 @@
     return element;
   }
 
+  const ROWS = ["video", "flow", "prediction", "difference"];
+
   function picture(parent, title, size, row) {
     const line = make(parent, "div", "", "label");
     make(line, "span", title);
@@ -38,6 +40,11 @@
       make(figure, "h2", robot.title);
       const view = { robot, column, figure, pictures: [picture(figure, several ? "truth" : "", robot.size, "video")], psnr: chosen.psnr[column] };
       view.pictures[0].canvas.setAttribute("aria-label", `Video of ${robot.title}`);
+      for (const row of chosen.rows.filter((name) => !ROWS.includes(name))) { // other cameras
+        const one = picture(figure, row, robot.size, row);
+        one.canvas.setAttribute("aria-label", `View ${row} of ${robot.title}`);
+        view.pictures.push(one);
+      }
       if (view.psnr) {
         for (const row of ["prediction", "difference"]) {
           const one = picture(figure, row, robot.size, row);
@@ -92,9 +99,10 @@
     context.setTransform(SHARP, 0, 0, SHARP, 0, 0);
     context.globalCompositeOperation = "source-over";
     tile(one.row);
-    const last = (one.row === "video" ? robot.frames : view.psnr.length) - 1;
+    const predicted = one.row === "prediction" || one.row === "difference";
+    const last = (predicted ? view.psnr.length : robot.frames) - 1;
     one.value.textContent = frame > last ? `ended at frame ${last}` : "";
-    if (one.row === "difference" || frame > last) return;
+    if (one.row === "difference" || !ROWS.includes(one.row) || frame > last) return;
     if (layers.flow && chosen.rows.includes("flow")) {
       if (robot.outlines) { // else its colors are lost on dark robots
         trace(context, robot.outlines[frame]);

@@ -20,6 +20,7 @@ import numpy as np
 import yaml
 
 from xew.config import ConfigError
+from xew.dataset import base_data
 from xew.episode import complete_folder
 from xew.files import cache_folder, read_json, write_text
 from xew.names import EpisodeError, check_name, path_below
@@ -181,8 +182,9 @@ def adopt_robots(names: Sequence[str], data: Path) -> tuple[str, ...]:
 
 
 def kept_robot(key: str, data: Path | None = None) -> RobotSpec | None:
-    """The robot of a key in a data set, or else in a folder of `XEW_ROBOTS`, or None."""
-    if data is not None and (description := Path(data) / KEPT / key / OWN).is_file():
+    """The robot of a key in a data set or the one that it is a view of, or else in a folder of `XEW_ROBOTS`, or None."""
+    roots = () if data is None else (Path(data), base_data(data))
+    if description := next((path for root in roots if (path := root / KEPT / key / OWN).is_file()), None):
         try:
             check_name(key, "robot")
             _demand_own_files(description, description.stat().st_mtime_ns)

@@ -1,0 +1,90 @@
+"""A new robot against changed scenes: common scenes, costs, marks, and what is no comparison."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from tests.analysis.test_beyond import write_scores
+from xew.analysis.beyond import Shifts, shifts_frame, shifts_table
+from xew.analysis.beyond.shifts import MODEL
+from xew.analysis.report import Args, main
+from xew.analysis.scores import Scores, read_scores
+from xew.config import ConfigError
+from xew.protocol import HELD_OUT_ROBOTS, SEEN_ROBOTS, TEST_SEED_START
+
+SCENES = [(task, TEST_SEED_START + i) for task in ("place_empty_cup", "beat_block_hammer") for i in range(8)]
+COSTS = {"light:1": 0.0, "light:3": 0.05, "height:2": 0.02}
+"""What each change adds to the model's LPIPS."""
+NEW = dict(zip(HELD_OUT_ROBOTS, (0.1, 0.03), strict=True))
+"""What each unseen robot adds."""
+
+
+def rows(errors: Mapping[str, float], scenes: list[tuple[str, int]], **cell: str) -> list[dict[str, object]]:
+    """Rows of one model on some robots, with their mean LPIPS and a spread over scenes that all share."""
+    spread = 0.02 * np.random.default_rng(3).standard_normal(len(SCENES))
+    return [
+        {"model": "m", "condition": "c", **cell, "task": task, "seed": seed, "robot": robot, "metric": metric, "value": value}
+        for robot, error in errors.items()
+        for (task, seed) in scenes
+        for metric, value in (("lpips", 0.2 + error + spread[SCENES.index((task, seed))]), ("psnr", 20.0))
+    ]
+
+
+@pytest.fixture(scope="module")
+def tables(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Path]]:
+    """A study's table, and one of each change; of the lower table the first scene is missing."""
+    root = tmp_path_factory.mktemp("shifts")
+    unchanged = write_scores(root / "scores.parquet", rows(dict.fromkeys(SEEN_ROBOTS, 0.0) | NEW, SCENES, variant=MODEL.name))
+    paths = []
+    for change, cost in COSTS.items():
+        scenes = SCENES[1:] if change.startswith("height") else SCENES
+        path = write_scores(root / f"{change.replace(':', '_')}.parquet", rows(dict.fromkeys(SEEN_ROBOTS, cost), scenes))
+        frame = pd.read_parquet(path)
+        frame.attrs |= {"change": change}
+        frame.to_parquet(path, index=False)
+        paths.append(path)
+    return unchanged, paths
+
+
+@pytest.fixture(scope="module")
+def read(tables: tuple[Path, list[Path]]) -> tuple[Scores, list[Scores]]:
+    return read_scores(tables[0]), [read_scores(path) for path in tables[1]]
+
+
+def test_costs_are_paired_over_the_scenes_that_all_have(read: tuple[Scores, list[Scores]]) -> None:
+    shifts = Shifts(*read)
+    assert shifts.scenes == len(SCENES) - 1 and shifts.changes == ["light:1", "light:3", "height:2"]
+    found = shifts_frame(shifts, "lpips").set_index("case")
+    for case, cost in (NEW | COSTS).items():
+        assert found.loc[case, "value"] == pytest.approx(cost, abs=1e-6)
+        assert found.loc[case, "high"] - found.loc[case, "low"] < 1e-5, "the spread over scenes cancels"
+    mean = shifts.mean("", "lpips")
+    assert mean is not None and mean.count == 3 * shifts.scenes
+
+
+def test_the_table_marks_what_costs_something(read: tuple[Scores, list[Scores]]) -> None:
+    table = shifts_table(Shifts(*read))
+    rows = {row.labels[0]: row.cells[0] for section in table.sections for row in section.rows}
+    assert [cell.verdict for cell in rows.values()] == ["", "worse", "worse", "unresolved", "worse", "worse"]
+    assert list(rows)[3:] == ["light, level 1", "light, level 3", "height, level 2"]
+
+
+def test_tables_that_do_not_compare_are_refused(read: tuple[Scores, list[Scores]]) -> None:
+    scores, shifted = read
+    for wrong in ([*shifted, shifted[0]], [*shifted, scores]):
+        with pytest.raises(ConfigError, match="expected one without a change, and one of each change"):
+            Shifts(scores, wrong)
+    other = replace(shifted[0], attributes={**shifted[0].attributes, "protocol": 99})
+    with pytest.raises(ConfigError, match="differ in protocol from the unchanged"):
+        Shifts(scores, [other])
+
+
+def test_the_report_has_one_table_and_one_chart(tables: tuple[Path, list[Path]], tmp_path: Path) -> None:
+    main(Args(tables[0], shifted=tuple(tables[1]), out=tmp_path))
+    text = (tmp_path / "report.md").read_text()
+    assert "## A new robot or a new lamp" in text and "Franka (Panda), never seen" in text
+    assert (tmp_path / "figures" / "shifts.png").stat().st_size > 1000
