@@ -149,7 +149,7 @@ def test_a_rollout_into_a_folder_that_another_writes_ends_in_one_line(
 ) -> None:
     data, out = tmp_path / "data", tmp_path / "out"
     flags = SimpleNamespace(data=data, out=out, checkpoint=None, split="test", robots=())
-    experiment = SimpleNamespace(instructions=SimpleNamespace(encode=list))
+    experiment = SimpleNamespace(instructions=SimpleNamespace(encode=list), view="head")
     monkeypatch.setattr(rollout, "parse_rollout", lambda _: (tmp_path / "run", flags, experiment))
     monkeypatch.setattr(rollout, "select_episodes", lambda *_: [])
     with held_by_another(out) as process, pytest.raises(SystemExit, match="2"):
