@@ -268,7 +268,9 @@ def test_patterns_are_periodic_and_the_same_on_every_machine() -> None:
     assert np.abs(np.diff(rows, axis=0, append=rows[:1])).max() < 0.1
 
 
-@pytest.mark.parametrize("step", [simulate, simulate_batch], ids=["one by one", "in a batch"])
+@pytest.mark.parametrize(
+    "step", [simulate, pytest.param(simulate_batch, marks=pytest.mark.lab)], ids=["one by one", "in a batch"]
+)
 def test_objects_stand_on_a_raised_table_in_both_engines(step: Callable[..., list[Motion]]) -> None:
     robot, scenes = ROBOTS["piper"], [make_scene(CLOSE, TASK, 0, change) for change in ("", "height:3")]
     flat, raised = step([World(robot, scene, stand_at_home(robot, 6)) for scene in scenes], "cpu")
