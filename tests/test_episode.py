@@ -85,6 +85,11 @@ def test_every_field_comes_back(folder: Path) -> None:
     assert verify_episode(folder) == record
 
 
+def test_an_unchanged_episode_of_the_head_camera_has_the_header_of_versions_without_views_and_changes(folder: Path) -> None:
+    header = (folder / "episode.json").read_text()
+    assert not {"camera", "change"} & json.loads(header).keys()
+
+
 def test_a_folder_says_task_seed_and_robot(folder: Path, tmp_path: Path) -> None:
     assert folder == episode_folder(tmp_path, "grab_roller", 7, "piper") == tmp_path / "grab_roller" / "0000007" / "piper"
     assert sorted(path.name for path in folder.iterdir()) == ["episode.json", "rgb.mkv", "robot.mkv", "states.npz"]

@@ -81,7 +81,7 @@ FORMS = {
 """Type and shape of each array of `States`."""
 MOVING_FORMS = FORMS | {"extrinsics": "float64 t 4 4"}
 """The same of a camera that moves."""
-NEW_FIELDS = ("camera",)
+NEW_FIELDS = ("camera", "change")
 """Fields of a header that are written only if they are not their default: headers without them keep their bytes."""
 
 
