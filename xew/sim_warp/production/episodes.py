@@ -11,7 +11,7 @@ import warp as wp
 import xew
 from xew.config import ConfigError
 from xew.episode import Record, States, read_record, write_episode
-from xew.protocol import parse_change
+from xew.protocol import CameraSpec, parse_change
 from xew.sim_warp.changes.looks import camera_of, stage_of
 from xew.sim_warp.geometry.camera import spec_camera
 from xew.sim_warp.production.cells import Cell
@@ -27,9 +27,8 @@ Pixels = tuple[Observation, np.ndarray]
 
 def render_cells(cells: Sequence[Cell], renderer: Renderer) -> list[Pixels]:
     """The camera's observation of each cell of a scene, and the robot alone by its commands [t h w 3] uint8."""
-    change = parse_change(cells[0].change)
-    camera = spec_camera(camera_of(change))
-    views = observe(renderer, [cell.recording for cell in cells], camera, stage_of(change))
+    camera = spec_camera(_camera(cells[0]))
+    views = observe(renderer, [cell.recording for cell in cells], camera, stage_of(parse_change(cells[0].change)))
     renders = command_renders([(cell.robot, cell.commands.action) for cell in cells], camera, renderer)
     return list(zip(views, renders, strict=True))
 
@@ -62,7 +61,7 @@ def header(cell: Cell, device: wp.Device) -> Record:
         device=device.name,
         motion=cell.motion_kind,
         change=cell.change,
-        camera=camera_of(parse_change(cell.change)),
+        camera=_camera(cell),
     )
 
 
@@ -82,9 +81,14 @@ def _versions() -> dict[str, str]:
     return {"xew": xew.__version__} | {name: version(name) for name in ("newton", "mujoco", "mujoco-warp", "warp-lang")}
 
 
+def _camera(cell: Cell) -> CameraSpec:
+    """The head camera as the change of the cell's scene has it."""
+    return camera_of(parse_change(cell.change))
+
+
 def _states(cell: Cell, view: Observation) -> States:
     assert cell.tool_pose is not None, "a cell that is rendered has been simulated"
-    camera = spec_camera(camera_of(parse_change(cell.change)))
+    camera = spec_camera(_camera(cell))
     return States(
         action=cell.commands.action,
         joint_pos=cell.known_motion.joint_pos,
