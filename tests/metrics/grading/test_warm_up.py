@@ -83,8 +83,9 @@ def test_parts_are_compiled_once(
 ) -> None:
     done: list[object] = []
 
-    def compile_here(opener: Callable[[], object], parts: list[object], *_: object) -> list[None]:
-        return [done.append(part) for part in parts]
+    def compile_here(opener: Callable[[], object], parts: list[object], *_: object) -> list[object]:
+        done.extend(parts)
+        return parts
 
     monkeypatch.setattr(open_graders, "map_in_processes", compile_here)
     start = functools.partial(open_graders.warm_up, resolved, gpus=("0",))

@@ -48,12 +48,15 @@ class Programs:
     def compile(self) -> None:
         """Grade noise by these metrics, if JAX has a GPU."""
         for shape in () if is_on_cpu() else self.shapes:
-            target = np.random.default_rng(0).integers(0, 256, (*shape, 3), np.uint8)
-            mask, points = np.zeros(shape, bool), np.zeros((shape[0], 0, 2), np.float32)
-            mask[:, shape[1] // 4 : -shape[1] // 4, shape[2] // 4 : -shape[2] // 4] = True
-            truth = Truth(target, mask, points, points[..., 0] > 0, points, points[..., 0] > 0)
-            episode = EpisodeCache(truth, 0)
-            grade(Comparison(np.roll(target, 1, axis=0), episode, lambda *_: mask, lambda *_: points), self.metrics)
+            self._grade_noise(shape)
+
+    def _grade_noise(self, shape: tuple[int, int, int]) -> None:
+        target = np.random.default_rng(0).integers(0, 256, (*shape, 3), np.uint8)
+        mask, points = np.zeros(shape, bool), np.zeros((shape[0], 0, 2), np.float32)
+        mask[:, shape[1] // 4 : -shape[1] // 4, shape[2] // 4 : -shape[2] // 4] = True
+        truth = Truth(target, mask, points, points[..., 0] > 0, points, points[..., 0] > 0)
+        prediction = np.roll(target, 1, axis=0)
+        grade(Comparison(prediction, EpisodeCache(truth, 0), lambda *_: mask, lambda *_: points), self.metrics)
 
 
 Part = Kernels | Programs
