@@ -3,11 +3,13 @@
 Frames go through the compiler in blocks of one size, so a few programs serve episodes of all lengths.
 """
 
+from functools import cached_property
 from typing import Any
 
 import jax
 import numpy as np
 
+from xew.metrics.estimators.appearance import TrueAppearance
 from xew.metrics.metric import ACCELERATOR_CHUNK
 from xew.metrics.perceptual import KEPT_FEATURES, SharedFeatures
 from xew.metrics.truth import Truth
@@ -39,7 +41,8 @@ class GradedVideo:
 
 
 class EpisodeCache:
-    """An episode and what all predictions of it share: the graded frames of its true video, and their LPIPS features.
+    """An episode and what all predictions of it share: the graded frames of its true video, their LPIPS features, and its
+    appearance.
 
     Args:
         truth: the episode.
@@ -50,6 +53,11 @@ class EpisodeCache:
         self.truth, self.first = truth, first
         self.target = GradedVideo(truth.rgb[first:])
         self.features = SharedFeatures(KEPT_FEATURES["cpu" if is_on_cpu() else "gpu"])
+
+    @cached_property
+    def appearance(self) -> TrueAppearance:
+        """The appearance that estimators compare predictions with."""
+        return TrueAppearance(self.truth.rgb, self.truth.labels)
 
 
 def is_on_cpu() -> bool:

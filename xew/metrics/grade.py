@@ -18,7 +18,6 @@ from xew.metrics import METRICS
 from xew.metrics.backends import Masker, Tracker
 from xew.metrics.episode_cache import EpisodeCache, GradedVideo, cut_blocks, fill_up, is_on_cpu
 from xew.metrics.estimators.appearance import REST as SCENE
-from xew.metrics.estimators.appearance import match_appearance
 from xew.metrics.estimators.presence import confirm_tracks
 from xew.metrics.perceptual import SMALLEST_SIDE, Box, lpips, region_lpips_frames, robot_lpips_frames, union_box
 from xew.metrics.truth import Points, Truth
@@ -125,7 +124,7 @@ class Comparison:
     @cached_property
     def _alike(self) -> tuple[np.ndarray, np.ndarray]:
         """The predicted and the true video in the same colors."""
-        return match_appearance(self._estimator_input, self.truth.rgb, self.truth.labels)
+        return self.episode.appearance.match(self._estimator_input)
 
     def _videos_for(self, estimator: object) -> tuple[np.ndarray, np.ndarray]:
         """The predicted and the true video as an estimator takes them."""

@@ -90,10 +90,11 @@ class Truth:
     @cached_property
     def labels(self) -> np.ndarray:
         """[t h w] int16, 0 for the robot, numbers from 1 for objects of known shapes, SCENE for the rest."""
-        labels = np.where(self.mask, 0, SCENE).astype(np.int16)
-        if self.surfaces is None or self.surfaces.body_id is None:
-            return labels
-        return np.where(~self.mask & (self.surfaces.body_id >= 0), self.surfaces.body_id + 1, labels).astype(np.int16)
+        labels = np.full(self.mask.shape, SCENE, np.int16)
+        if self.surfaces is not None and self.surfaces.body_id is not None:
+            np.copyto(labels, self.surfaces.body_id + 1, casting="unsafe", where=self.surfaces.body_id >= 0)
+        labels[self.mask] = 0
+        return labels
 
     @cached_property
     def keypoint_diagonal(self) -> np.ndarray:

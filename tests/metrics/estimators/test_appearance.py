@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from lab.calibration.predictors import add_grain, expose, flicker, soften
-from xew.metrics.estimators.appearance import REST, even_exposure, match_appearance, take_colors
+from xew.metrics.estimators.appearance import REST, TrueAppearance, _describe, match_appearance
 
 T, H, W = 14, 120, 160
 rng = np.random.default_rng(3)
@@ -95,11 +95,26 @@ def test_a_body_that_the_truth_shows_later_has_the_colors_of_its_first_frames() 
     hidden[:5][hidden[:5] == 3] = REST
     truth = np.where(((LABELS == 3) & (hidden != 3))[..., None], SCENE, TRUTH)
     wrong = np.where((hidden == 3)[..., None], 255 - truth, truth)
-    reference = take_colors(truth, wrong, hidden)
+    reference = TrueAppearance(truth, hidden).take_colors(wrong)
     assert np.abs(reference.astype(int) - wrong)[hidden == 3].mean() < 4
 
 
 def test_without_a_scene_there_is_no_exposure() -> None:
-    assert even_exposure(expose(TRUTH, 0.8), TRUTH, np.zeros(LABELS.shape, bool)) is not None
     brighter = expose(TRUTH, 0.8)
-    assert even_exposure(brighter, TRUTH, np.zeros(LABELS.shape, bool)) is brighter
+    assert TrueAppearance(TRUTH, np.zeros_like(LABELS)).even_exposure(brighter) is brighter
+
+
+@pytest.mark.parametrize("count", [41, 44, 1001, 4800])
+def test_percentiles_are_those_of_numpy(count: int) -> None:
+    levels = np.random.default_rng(count).integers(0, 256, (3, count), np.uint8)
+    spread, middle = _describe(levels)
+    values = levels.T.astype(np.float32)
+    np.testing.assert_array_equal(spread, np.diff(np.percentile(values, (10, 90), axis=0), axis=0)[0])
+    np.testing.assert_array_equal(middle, np.median(values, axis=0))
+
+
+def test_what_predictions_share_leaves_no_trace() -> None:
+    shared = TrueAppearance(TRUTH, LABELS)
+    for wrong in (flicker(TRUTH), np.where((LABELS == 3)[..., None], 255 - TRUTH, TRUTH), TRUTH, expose(TRUTH, 0.8)):
+        for found, expected in zip(shared.match(wrong), match_appearance(wrong, TRUTH, LABELS), strict=True):
+            np.testing.assert_array_equal(found, expected)
