@@ -13,7 +13,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from xew.concurrency import free_gpu_memory, leave_with_parent, map_in_order, map_in_processes, map_with_shared_memory
+from xew.concurrency import (
+    count_done,
+    free_gpu_memory,
+    leave_with_parent,
+    map_in_order,
+    map_in_processes,
+    map_with_shared_memory,
+)
 from xew.episode import EpisodeError
 
 
@@ -253,3 +260,11 @@ def test_no_memory_is_left_behind_who_takes_no_more_results(tmp_path: Path) -> N
 def test_small_results_need_no_shared_memory() -> None:
     found = map_with_shared_memory(open_reader, ["HOME", "PATH"], 1)
     assert [text for text, _ in found] == [os.environ["HOME"], os.environ["PATH"]]
+
+
+def test_what_processes_put_is_counted_until_the_end() -> None:
+    done: list[None] = []
+    with count_done(lambda: done.append(None)) as queue:
+        for _ in range(3):
+            queue.put(True)
+    assert len(done) == 3

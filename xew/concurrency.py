@@ -14,6 +14,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from multiprocessing import forkserver
 from multiprocessing.queues import SimpleQueue
 from multiprocessing.synchronize import Event as ProcessEvent
@@ -171,6 +172,19 @@ def map_in_processes(
         raise EpisodeError(f"{KILLED}, and end other programs or use fewer processes if it happens again.") from error
     finally:
         pool.shutdown(cancel_futures=True)
+
+
+@contextmanager
+def count_done(done: Callable[[], object]) -> Iterator["SimpleQueue[Any]"]:
+    """Yield a queue for `open_processes`; in another thread, `done` is called for everything that processes put into it."""
+    queue = multiprocessing.get_context("forkserver").SimpleQueue()
+    follower = threading.Thread(target=lambda: [done() for _ in iter(queue.get, None)])
+    follower.start()
+    try:
+        yield queue
+    finally:
+        queue.put(None)
+        follower.join()
 
 
 def map_with_shared_memory(

@@ -13,6 +13,7 @@ Writes scores.parquet, one row per model, condition, task, seed, robot and metri
 """
 
 import gc
+import sys
 import threading
 from dataclasses import replace
 from pathlib import Path
@@ -27,12 +28,15 @@ from xew.files import hold_lock
 from xew.metrics import METRICS
 from xew.metrics.grading.baselines import BASELINES
 from xew.metrics.grading.bundle import Bundle, differences, disagreements, raise_if_any, read_bundle
-from xew.metrics.grading.grade_episodes import collect_results, group_jobs
+from xew.metrics.grading.grade_episodes import describe_results, group_jobs
 from xew.metrics.grading.list_jobs import list_jobs
-from xew.metrics.grading.open_graders import grade_groups, open_grader, prepare_process
+from xew.metrics.grading.open_graders import grade_groups, open_grader, prepare_graders, prepare_process
 from xew.metrics.grading.scores import check_out
 from xew.metrics.grading.settings import Args, resolve
 from xew.metrics.grading.write_scores import write_scores
+
+SECONDS_IN_LOGS = 10.0
+"""Shortest time between two lines of progress that are not on a terminal."""
 
 
 @user_errors
@@ -50,11 +54,15 @@ def main(args: Args) -> None:
 def grade_tables(args: Args) -> None:
     """Grade, write the tables and print the summary. Raises EpisodeError where a rollout could not be graded."""
     settings = resolve(args)
+    prepare_graders()
     listing = list_jobs(settings)
-    groups = group_jobs(settings, listing.jobs)
-    results = grade_groups(settings, listing.codecs, groups)
-    errors = [*listing.errors, *collect_results(groups, results, len(listing.jobs))]
-    print(write_scores(settings, listing))
+    groups, total = group_jobs(settings, listing.jobs), len(listing.jobs)
+    interval = 0.1 if sys.stderr.isatty() else SECONDS_IN_LOGS
+    before = total - sum(map(len, groups))
+    with tqdm(total=total, initial=before, desc="evaluate", unit="video", mininterval=interval) as bar:
+        results = list(grade_groups(settings, listing.codecs, groups, bar.update))
+    errors = [*listing.errors, *(error for result in results for error in result.errors)]
+    print(*filter(None, [describe_results(results, total)]), write_scores(settings, listing), sep="\n")
     if errors:
         total = len(listing.jobs) + len(listing.errors)
         raise EpisodeError(f"{len(errors)} of {total} could not be graded:", *(f"  {error}" for error in errors))

@@ -77,8 +77,9 @@ def test_another_robot_is_the_next_by_name_in_the_same_scene(data: Path, tmp_pat
     folder = episode(copy, "arx_x5")
     states, rgb, robot = read_states(folder), read_video(folder / "rgb.mkv"), read_video(folder / "robot.mkv")
     write_episode(copy, replace(read_record(folder), scene_hash="another"), states, rgb, robot)
-    assert find_other_robot(episode(copy, "piper")) == episode(copy, "franka_panda")
-    assert find_other_robot(folder) is None
+    other = find_other_robot(episode(copy, "piper"), read_record(episode(copy, "piper")))
+    assert other is not None and other[0] == episode(copy, "franka_panda")
+    assert find_other_robot(folder, read_record(folder)) is None
 
 
 def test_what_the_data_do_not_hold_is_left_out(data: Path, tmp_path: Path) -> None:

@@ -227,6 +227,36 @@ def test_processes_write_the_same_bytes_and_raise_mistakes(
         list(evaluate.grade_groups(resolved, {}, [[job] for job in gone]))
 
 
+@pytest.mark.parametrize("processes", ["1", "2"])
+def test_progress_counts_videos_not_episodes(
+    world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, processes: str
+) -> None:
+    monkeypatch.setenv(PROCESSES, processes)
+    done: list[None] = []
+    resolved = settings.resolve(arguments(world, tmp_path / "scores.parquet"))
+    groups = grade_episodes.group_jobs(resolved, evaluate.list_jobs(resolved).jobs)
+    results = evaluate.grade_groups(resolved, {}, groups, lambda: done.append(None))
+    next(results)
+    assert done, "before the last episode"
+    assert len({result.episode for result in results}) == EPISODES - 1 and len(done) == CELLS
+
+
+@pytest.mark.parametrize(
+    ("videos", "processes", "parts"),
+    [
+        ([5] * 2500, 48, [5] * 2500),
+        ([15] * 84, 48, [9, 6] * 84),
+        ([30], 8, [4] * 7 + [2]),
+        ([1, 6], 2, [1, 4, 2]),
+    ],
+)
+def test_few_episodes_with_many_videos_are_divided(videos: list[int], processes: int, parts: list[int]) -> None:
+    groups = [[(None, (f"{i} {j}",)) for j in range(count)] for i, count in enumerate(videos)]
+    divided = grade_episodes.split_groups(groups, processes)  # type: ignore[arg-type]
+    assert list(map(len, divided)) == parts
+    assert [job for part in divided for job in part] == [job for group in groups for job in group]
+
+
 @pytest.mark.parametrize(
     ("cores", "free", "videos", "expected"),
     [

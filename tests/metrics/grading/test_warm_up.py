@@ -101,4 +101,4 @@ def test_parts_are_compiled_once(
 def test_no_gpu_compiles_nothing(resolved: GradingSettings, jobs: list[list_jobs.Job], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(open_graders, "warm_up", lambda *_: pytest.fail("there is no GPU"))
     monkeypatch.setattr(open_graders, "visible_gpus", tuple)
-    open_graders.grade_groups(resolved, {}, [[(job, ("psnr",))] for job in jobs])
+    list(open_graders.grade_groups(resolved, {}, [[(jobs[0], ("psnr",))]]))

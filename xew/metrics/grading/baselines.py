@@ -13,6 +13,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from xew.dataset import Episode
 from xew.episode import WHITE, Record, read_pixels, read_record
 from xew.metrics.truth import Truth
 from xew.protocol import COPY_FIRST_FRAME, GROUND_TRUTH, OTHER_ROBOT, PASTED_RENDER
@@ -71,22 +72,23 @@ def _white_ground(frame: np.ndarray) -> np.ndarray:
 
 def other_robot(folder: Path, truth: Truth) -> np.ndarray:
     """The true episode of the next robot by name in the same scene: uint8 [t h w 3]; a shorter one stands still at its end."""
-    other = find_other_robot(folder)
+    other = find_other_robot(folder, read_record(folder))
     assert other is not None, "BASELINES asks before"
-    video = read_pixels(other, "rgb")
+    video = read_pixels(other[0], "rgb", record=other[1])
     return video[np.minimum(np.arange(len(truth.rgb)), len(video) - 1)]
 
 
-def find_other_robot(folder: Path) -> Path | None:
-    """The folder of the next robot by name, in a circle, whose episode of the same scene has its video."""
-    record = read_record(folder)
+def find_other_robot(folder: Path, record: Record) -> Episode | None:
+    """The next robot's episode by name, in a circle, that is of the same scene and has its video.
+
+    `record` is the header of the episode in the folder.
+    """
     names = sorted(path.name for path in folder.parent.iterdir() if (path / "episode.json").exists())
     place = names.index(folder.name)
     for name in names[place + 1 :] + names[:place]:
-        other = folder.parent / name
-        candidate = read_record(other)
+        candidate = read_record(folder.parent / name)
         if candidate.success and candidate.videos and candidate.scene_hash == record.scene_hash:
-            return other
+            return folder.parent / name, candidate
     return None
 
 
@@ -95,8 +97,8 @@ def _render_digest(folder: Path, record: Record) -> str | None:
 
 
 def _other_digest(folder: Path, record: Record) -> str | None:
-    other = find_other_robot(folder)
-    return None if other is None else read_record(other).hashes["rgb"]
+    other = find_other_robot(folder, record)
+    return None if other is None else other[1].hashes["rgb"]
 
 
 BASELINES: dict[str, Baseline] = {

@@ -4,13 +4,12 @@ processes.
 
 import itertools
 import threading
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
-from tqdm import tqdm
 
 from xew.episode import EpisodeError, read_record
 from xew.metrics.backends import Masker, Tracker
@@ -35,6 +34,11 @@ OTHER_ASPECT = (
 )
 """Remedy for a video of another aspect ratio, in words."""
 
+PARTS_OF_PROCESS = 3
+"""Number of parts for each process from which on episodes are not divided."""
+FEWEST_OF_PART = 4
+"""Number of videos for which an episode is worth being read again."""
+
 Group = list[tuple[Job, tuple[str, ...]]]
 """Jobs of one episode, each with the names of the metrics that are still to be graded."""
 
@@ -43,6 +47,7 @@ Group = list[tuple[Job, tuple[str, ...]]]
 class GroupResult:
     """What came of grading a group, besides the scores in the store."""
 
+    episode: Path
     errors: Sequence[str]
     notes: Sequence[tuple[str, Path]]
     """Remarks on graded videos, each with the video's file."""
@@ -66,6 +71,8 @@ class Grader:
     codecs: Mapping[str, ModelCodec]
     stop: threading.Event
     """Signal that no further video is to be begun."""
+    done: Callable[[], object]
+    """Called after each video."""
 
     def __call__(self, group: Group) -> GroupResult:
         """Grade jobs of one episode, which is read once, and enter the scores.
@@ -87,9 +94,10 @@ class Grader:
                 if not self.settings.args.keep_going:
                     raise RolloutError(message) from error
                 errors.append(message)
+            self.done()
         surfaces = episode.truth.surfaces if episode else None
         on_surfaces = any(input_kind(name) in ON_SURFACES for _, names in group for name in names)
-        return GroupResult(errors, notes, has_shapes=not on_surfaces or surfaces is None or surfaces.known)
+        return GroupResult(group[0][0].episode, errors, notes, has_shapes=not on_surfaces or surfaces is None or surfaces.known)
 
     def read_episode(self, group: Group) -> EpisodeCache:
         """The episode of a group's jobs, as far as their metrics need it. Raises EpisodeError as `read_truth`."""
@@ -233,32 +241,23 @@ def group_jobs(settings: GradingSettings, jobs: Sequence[Job]) -> list[Group]:
     return sorted(groups, key=lambda group: len(group) * group[0][0].cell.frames, reverse=True)
 
 
-def collect_results(groups: Sequence[Group], results: Iterable[GroupResult], total: int) -> list[str]:
-    """Show progress and return one message for each video that could not be graded.
+def split_groups(groups: Sequence[Group], processes: int) -> list[Group]:
+    """The groups, divided where few episodes have so many videos that processes would wait for the last one."""
+    most = max(FEWEST_OF_PART, -(-sum(map(len, groups)) // (PARTS_OF_PROCESS * processes)))
+    return [group[start : start + most] for group in groups for start in range(0, len(group), most)]
 
-    Args:
-        groups, results: the groups and their results, in the same order.
-        total: number of all videos, including those graded before.
 
-    Raises:
-        RolloutError: a video cannot be graded, as `Grader` raises it.
-    """
-    errors: list[str] = []
-    without_shapes = []
+def describe_results(results: Sequence[GroupResult], total: int) -> str:
+    """What users must know of graded videos, in lines; `total` is the number of all videos, with those graded before."""
     noted: dict[str, list[Path]] = {}
-    done = total - sum(map(len, groups))
-    with tqdm(total=total, initial=done, desc="evaluate", unit="video", disable=None) as bar:
-        for group, result in zip(groups, results, strict=True):
-            errors += result.errors
-            for note, path in result.notes:
-                noted.setdefault(note, []).append(path)
-            without_shapes += [] if result.has_shapes else [group[0][0].episode]
-            bar.update(len(group))
-    for note, paths in sorted(noted.items()):
-        print(f"{len(paths)} of {total} videos {note} (such as {min(paths)})")
+    for note, path in (noted_video for result in results for noted_video in result.notes):
+        noted.setdefault(note, []).append(path)
+    lines = [f"{len(paths)} of {total} videos {note} (such as {min(paths)})" for note, paths in sorted(noted.items())]
+    without_shapes = {result.episode for result in results if not result.has_shapes}
     if without_shapes:
-        print(
-            f"the shapes of {len(without_shapes)} of {len(groups)} episodes are not known (imported, or of another version of "
-            f"their task, such as {min(without_shapes)}): their strict metrics of points are of links' and objects' origins"
+        lines.append(
+            f"the shapes of {len(without_shapes)} of {len({result.episode for result in results})} episodes are not known "
+            f"(imported, or of another version of their task, such as {min(without_shapes)}): their strict metrics of points "
+            "are of links' and objects' origins"
         )
-    return errors
+    return "\n".join(lines)

@@ -8,6 +8,7 @@ import functools
 import os
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from multiprocessing.queues import SimpleQueue
 from typing import Any, TypeVar
 
 import cv2
@@ -16,12 +17,20 @@ import numpy as np
 from tqdm import tqdm
 
 from xew.compilation import keep_compiled_programs, take_memory_as_needed
-from xew.concurrency import free_gpu_memory, map_in_order, map_in_processes, usable_cores, visible_gpus
+from xew.concurrency import (
+    count_done,
+    free_gpu_memory,
+    map_in_order,
+    map_in_processes,
+    prepare_processes,
+    usable_cores,
+    visible_gpus,
+)
 from xew.config import admit, pick
 from xew.metrics.backends import MASKERS, TRACKERS, Masker, Tracker, open_masker, open_tracker
 from xew.metrics.grade import input_kind
 from xew.metrics.grading.codecs import ModelCodec, open_codecs
-from xew.metrics.grading.grade_episodes import Grader, Group, GroupResult, ThreadResources
+from xew.metrics.grading.grade_episodes import Grader, Group, GroupResult, ThreadResources, split_groups
 from xew.metrics.grading.list_jobs import Job
 from xew.metrics.grading.settings import GradingSettings
 from xew.metrics.grading.warm_up import Part, missing_parts, note_compiled
@@ -53,20 +62,34 @@ def prepare_process(trust: Sequence[str]) -> None:
     cv2.setNumThreads(1)  # episodes are shared out; OpenCV's own threads would only get in the way
 
 
-def grade_groups(settings: GradingSettings, codecs: Mapping[str, ModelCodec], groups: Sequence[Group]) -> Iterator[GroupResult]:
-    """Results of all groups in their order, from as many processes or threads as suit the machine.
+def prepare_graders() -> None:
+    """Start importing what processes that grade need, while jobs are listed, on machines that grade in processes."""
+    if visible_gpus() or usable_cores() > MOST_THREADS:
+        prepare_processes(IMPORTED)
 
-    They are at most a few groups ahead of each other, so memory does not grow with the number of groups.
+
+def grade_groups(
+    settings: GradingSettings,
+    codecs: Mapping[str, ModelCodec],
+    groups: Sequence[Group],
+    done: Callable[[], object] = lambda: None,
+) -> Iterator[GroupResult]:
+    """Results of all groups in their order, or of their parts, from as many processes or threads as suit the machine.
+
+    `done` is called after each video.
     """
     processes, gpus = choose_processes(len(groups), sum(map(len, groups))), visible_gpus()
     if gpus and groups:
         warm_up(settings, [job for group in groups for job, _ in group], gpus)
     if processes > 1:
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # processes share the cores
-        return map_in_processes(functools.partial(_open_in_process, settings), groups, processes, IMPORTED, gpus)
+        with count_done(done) as queue:
+            opener = functools.partial(_open_in_process, settings, queue)
+            yield from map_in_processes(opener, split_groups(groups, processes), processes, IMPORTED, gpus)
+        return
     threads = 1 if jax.default_backend() != "cpu" or gpus else min(usable_cores(), MOST_THREADS)
     stop = threading.Event()
-    return map_in_order(open_grader(settings, codecs, stop), groups, threads, stop)
+    yield from map_in_order(open_grader(settings, codecs, stop, done), groups, threads, stop)
 
 
 def warm_up(settings: GradingSettings, jobs: Sequence[Job], gpus: Sequence[str]) -> None:
@@ -102,13 +125,23 @@ def choose_processes(episodes: int, videos: int) -> int:
     return min(cores, MOST_PROCESSES["cpu"], max(1, int(memory / MEMORY_OF_PROCESS)), episodes)
 
 
-def _open_in_process(settings: GradingSettings) -> Grader:
+def _open_in_process(settings: GradingSettings, queue: "SimpleQueue[bool]") -> Grader:
     prepare_process(settings.args.trust)
-    return open_grader(settings, open_codecs(settings.args.codec), threading.Event())
+    return open_grader(settings, open_codecs(settings.args.codec), threading.Event(), lambda: queue.put(True))
 
 
-def open_grader(settings: GradingSettings, codecs: Mapping[str, ModelCodec], stop: threading.Event) -> Grader:
-    """Open the estimators that the metrics need; `stop` is set when no further video is to start. Raises ConfigError."""
+def open_grader(
+    settings: GradingSettings,
+    codecs: Mapping[str, ModelCodec],
+    stop: threading.Event,
+    done: Callable[[], object] = lambda: None,
+) -> Grader:
+    """Open the estimators that the metrics need. Raises ConfigError.
+
+    Args:
+        stop: set when no further video is to start.
+        done: called after each video.
+    """
     args, kinds = settings.args, {input_kind(name) for name in settings.metrics}
     masker: Callable[[], Masker] = _open_nothing
     tracker: Callable[[], Tracker] = _open_nothing
@@ -116,7 +149,7 @@ def open_grader(settings: GradingSettings, codecs: Mapping[str, ModelCodec], sto
         masker = _make_opener(MASKERS, args.masks, functools.partial(open_masker, args.masks, args.masks_checkpoint))
     if kinds & POINT_KINDS:
         tracker = _make_opener(TRACKERS, args.tracks, functools.partial(open_tracker, args.tracks, args.tracks_checkpoint))
-    return Grader(settings, ThreadResources(masker, tracker), {codec.key: codec for codec in codecs.values()}, stop)
+    return Grader(settings, ThreadResources(masker, tracker), {codec.key: codec for codec in codecs.values()}, stop, done)
 
 
 def _open_nothing() -> Any:

@@ -5,7 +5,6 @@ import itertools
 import multiprocessing
 import os
 import sys
-import threading
 from collections import deque
 from collections.abc import Callable, Sequence
 from multiprocessing.queues import SimpleQueue
@@ -16,7 +15,15 @@ from typing import Any
 import jax
 from tqdm import tqdm
 
-from xew.concurrency import free_gpu_memory, map_in_order, map_in_processes, prepare_processes, usable_cores, visible_gpus
+from xew.concurrency import (
+    count_done,
+    free_gpu_memory,
+    map_in_order,
+    map_in_processes,
+    prepare_processes,
+    usable_cores,
+    visible_gpus,
+)
 from xew.dataset import Episode
 from xew.model.sampling import reading
 from xew.model.sampling.predict import Prediction, Predictor
@@ -64,9 +71,9 @@ def roll_out_on_gpus(
         done: called for every written rollout, in another thread.
     """
     ordered, context = sorted(pending, key=_frames), multiprocessing.get_context("forkserver")
-    written, stop = context.SimpleQueue(), context.Event()
+    stop = context.Event()
 
-    def run(number: int) -> None:
+    def run(written: SimpleQueue, number: int) -> None:
         opener_of_part, imported = functools.partial(opener, written, stop), (__name__, *reading.IMPORTED)
         try:
             list(map_in_processes(opener_of_part, [ordered[number :: len(gpus)]], 1, imported, gpus[number : number + 1]))
@@ -74,13 +81,8 @@ def roll_out_on_gpus(
             stop.set()
             raise
 
-    follower = threading.Thread(target=lambda: [done() for _ in iter(written.get, None)])
-    follower.start()
-    try:
-        list(map_in_order(run, range(min(len(gpus), len(ordered))), len(gpus), stop))
-    finally:
-        written.put(None)
-        follower.join()
+    with count_done(done) as written:
+        list(map_in_order(functools.partial(run, written), range(min(len(gpus), len(ordered))), len(gpus), stop))
 
 
 def _open_part(open_predictor: Callable[[], Predictor], out: Path, written: SimpleQueue, stop: Event) -> Part:
