@@ -189,6 +189,9 @@ def test_baselines_are_graded_once_a_data_set(
     main(arguments(world, tmp_path / "scores.parquet"))
     assert len(asked) == EPISODES
     assert read_all(tmp_path / "scores.parquet") == whole
+    for i, choice in enumerate(({"allow": ("trim", "rate")}, {"allow": ("resize",), "keep_going": True}), 2):
+        main(replace(arguments(world, tmp_path / f"scores{i}.parquet"), **choice))
+        assert len(asked) == i * EPISODES, "what is allowed of videos changes no baseline"
 
 
 def test_other_settings_are_graded_anew(world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

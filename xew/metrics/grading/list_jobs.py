@@ -19,6 +19,9 @@ from xew.protocol import BASELINES as TITLES
 from xew.protocol import CODEC_TRUTH, seed_split
 from xew.rollout import Rollout, RolloutError, find_rollouts
 
+WITHOUT_PREDICTION = {"frame_zero": "given", "allowed": []}
+"""Choices about videos of models, as they are without any. Baselines do not depend on them: all models share their scores."""
+
 
 @dataclass(frozen=True)
 class Job:
@@ -128,11 +131,14 @@ def _jobs(rollout: Rollout, settings: GradingSettings, baselines: Collection[str
     key = (rollout.model, rollout.condition, rollout.task, rollout.seed, rollout.robot)
     cell = Cell(*key, frames, digest, rgb, states, str(settings.choices))
     yield Job(cell, rollout, episode, record)
-    yield from _baseline_jobs(cell, (episode, record), baselines, () if codec is None else (codec,))
+    yield from _baseline_jobs(cell, (episode, record), settings, baselines, () if codec is None else (codec,))
 
 
-def _baseline_jobs(cell: Cell, episode: Episode, baselines: Collection[str], codecs: Iterable[ModelCodec]) -> Iterator[Job]:
+def _baseline_jobs(
+    cell: Cell, episode: Episode, settings: GradingSettings, baselines: Collection[str], codecs: Iterable[ModelCodec]
+) -> Iterator[Job]:
     folder, record = episode
+    cell = replace(cell, settings=str(settings.choices | WITHOUT_PREDICTION))
     for name in baselines:
         source = BASELINES[name].source(folder, record)
         if source is not None:
@@ -158,7 +164,7 @@ def _list_baseline_jobs(settings: GradingSettings, baselines: Collection[str], c
         rgb, states = (record.hashes.get(name, "") for name in ("rgb", "states"))
         frames = min(record.frame_count, args.max_frames or record.frame_count)
         cell = Cell("", "", record.task, record.seed, record.robot, frames, "", rgb, states, str(settings.choices))
-        jobs += _baseline_jobs(cell, (folder, record), baselines, codecs.values())
+        jobs += _baseline_jobs(cell, (folder, record), settings, baselines, codecs.values())
     return sorted(jobs, key=lambda job: (job.episode, job.cell.key))
 
 

@@ -65,7 +65,12 @@ def prepare_process(trust: Sequence[str]) -> None:
 def prepare_graders() -> None:
     """Start importing what processes that grade need, while jobs are listed, on machines that grade in processes."""
     if visible_gpus() or usable_cores() > MOST_THREADS:
-        prepare_processes(IMPORTED)
+        _start_imports()
+
+
+def _start_imports() -> None:
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # read at the import of NumPy; processes share the cores
+    prepare_processes(IMPORTED)
 
 
 def grade_groups(
@@ -82,7 +87,7 @@ def grade_groups(
     if gpus and groups:
         warm_up(settings, [job for group in groups for job, _ in group], gpus)
     if processes > 1:
-        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # processes share the cores
+        _start_imports()
         with count_done(done) as queue:
             opener = functools.partial(_open_in_process, settings, queue)
             yield from map_in_processes(opener, split_groups(groups, processes), processes, IMPORTED, gpus)
