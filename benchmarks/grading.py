@@ -6,10 +6,12 @@
 
 Needs a data set with test seeds, of several robots where another robot's episode is to be graded too. The model's rollouts
 are made here: the true video, four frames late and softened, as a model errs. The command is run as users run it, in a
-process of its own, once for each way to programs and kernels that are not there yet, and then again from no scores: the
-second time is told by the clock, of one process its processor time beside it, and a ratio to the first way.
-Before a figure is told it is checked that all videos are graded, and that each way gives the scores of the first: the mean
-difference of a metric's scores at most 2 % of their spread over all videos.
+process of its own: once for each way to compile programs and kernels that are missing, then again without scores, and a
+third time with the baselines' scores only, as for a further model. Of the second run the table has the clock's time, the
+time until the first video is graded, with one process its processor time, and a ratio to the first way. A second table has
+the stages of one video in this process.
+Before a figure is printed it is checked that all videos are graded, and that each way gives the scores of the first: the
+mean difference of a metric's scores at most 2 % of their spread over all videos.
 """
 
 import os
@@ -18,8 +20,11 @@ import resource
 import shutil
 import subprocess
 import sys
+import threading
 import time
+from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,7 +36,14 @@ import tyro
 from lab.calibration.predictors import delay, soften
 from xew.dataset import read_dataset
 from xew.episode import read_video
-from xew.metrics.grading.open_graders import PROCESSES
+from xew.metrics import METRICS
+from xew.metrics.grade import Comparison
+from xew.metrics.grade import grade as grade_video
+from xew.metrics.grading.grade_episodes import read_prediction
+from xew.metrics.grading.list_jobs import list_jobs
+from xew.metrics.grading.open_graders import PROCESSES, open_grader, prepare_process
+from xew.metrics.grading.settings import Args as Settings
+from xew.metrics.grading.settings import resolve
 from xew.rollout import write_rollout
 
 LATE = 4
@@ -61,12 +73,14 @@ def main(args: Args) -> None:
     print(f"{platform.processor()}, {os.cpu_count()} cores; {count} episodes")
     first: pd.Series[Any] | None = None
     fastest = 0.0
-    print("| estimators | processes | first time [s] | again [s] | processor time [s] | factor | videos/s |")
-    print("|---" * 7 + "|")
+    print(
+        "| estimators | processes | first time [s] | again [s] | first video [s] | processor time [s] | factor | videos/s | model only [s] |"
+    )
+    print("|---" * 9 + "|")
     for way in args.ways:
         estimators, processes = way.split(":")
-        cold, _ = grade(args, estimators, processes)
-        seconds, busy = grade(args, estimators, processes)
+        cold, _, _ = grade(args, estimators, processes)
+        seconds, first_video, busy = grade(args, estimators, processes)
         scores = pd.read_parquet(args.out / "scores.parquet").set_index(KEY)["value"]
         videos = len(scores.groupby(KEY[:-1]))
         assert videos >= (4 + bool(args.codec)) * count, f"{videos} videos of {count} episodes: baselines are missing"
@@ -74,8 +88,13 @@ def main(args: Args) -> None:
             first, fastest = scores, seconds
         compare(way, first, scores)
         processor = f"{busy:.0f}" if processes == "1" else "-"  # nobody waits for processes of a fork server, or counts them
-        cells = [f"{cold:.1f}", f"{seconds:.1f}", processor, f"{seconds / fastest:.2f}", f"{videos / seconds:.1f}"]
+        further, _, _ = grade(args, estimators, processes, baselines=False)
+        cells = [f"{cold:.1f}", f"{seconds:.1f}", f"{first_video:.1f}", processor, f"{seconds / fastest:.2f}"]
+        cells += [f"{videos / seconds:.1f}", f"{further:.1f}"]
         print("| " + " | ".join([estimators, processes, *cells]) + " |", flush=True)
+    print("\n| one video, this process | ms |\n|---|---|")
+    for stage, seconds in time_stages(args).items():
+        print(f"| {stage} | {1000 * seconds:.0f} |")
 
 
 def make_workload(args: Args) -> int:
@@ -105,18 +124,67 @@ def make_rollout(args: Args, folder: Path) -> None:
     write_rollout(args.out / "rollouts", task, int(seed), robot, video, header)
 
 
-def grade(args: Args, estimators: str, processes: str) -> tuple[float, float]:
-    """Seconds of the command from no scores, by the clock and of the processors of its own process."""
-    for path in (*args.out.glob("scores*"), args.out / "data-baselines"):
+def grade(args: Args, estimators: str, processes: str, baselines: bool = True) -> tuple[float, float, float]:
+    """Seconds of the command without scores, until its first video is graded, and of the processors of its own process.
+
+    `baselines`: whether it grades the baselines, too; otherwise it finds their scores.
+    """
+    kept = args.out / "data-baselines"
+    for path in (*args.out.glob("scores*"), *([kept] if baselines else [])):
         shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
     command = [sys.executable, "-m", "xew.metrics.evaluate", "rollouts", "--data", "data"]
     command += ["--masks", estimators, "--tracks", estimators]
     command += ["--codec", str(args.codec.resolve())] if args.codec else []
-    start, before = time.perf_counter(), busy_seconds()
+    start, clock, before = time.perf_counter(), time.time(), busy_seconds()
     with (args.out / "log.txt").open("a", encoding="utf-8") as log:
         done = subprocess.run(command, cwd=args.out, stdout=log, stderr=subprocess.STDOUT, env=environment(processes))
     assert done.returncode == 0, f"{' '.join(command)} failed; see {args.out}/log.txt"
-    return time.perf_counter() - start, busy_seconds() - before
+    seconds = time.perf_counter() - start
+    cells = [path for folder in (args.out / "scores.cells", kept) for path in folder.rglob("*.json")]
+    first_video = min(path.stat().st_mtime for path in cells if path.stat().st_mtime > clock) - clock
+    return seconds, first_video, busy_seconds() - before
+
+
+def time_stages(args: Args) -> dict[str, float]:
+    """Seconds of each stage of grading the first video of an episode, compiled before."""
+    prepare_process(())
+    settings = resolve(Settings((args.out / "rollouts",), args.out / "data", args.out / "stages.parquet", baselines=False))
+    listing = list_jobs(settings)
+    job = max(listing.jobs, key=lambda job: job.cell.frames)
+    assert job.rollout is not None, "baselines are left out"
+    for _ in range(2):
+        grader = open_grader(settings, {}, threading.Event())
+        seconds: dict[str, float] = {}
+        with timed(seconds, "episode: video, states, points on surfaces"):
+            episode = grader.read_episode([(job, settings.metrics)])
+        with timed(seconds, "the model's video"):
+            video, _ = read_prediction(job, job.rollout, episode.truth, settings.args)
+        comparison = Comparison(video, episode, grader.resources.masker, grader.resources.tracker)
+        with timed(seconds, "colors"):
+            episode.appearance.match(video)
+        with timed(seconds, "masks, with colors"):
+            comparison.estimate_masks()
+        with timed(seconds, "points"):
+            comparison.track("robot_points")
+            comparison.track("keypoints")
+        parts: dict[str, list[str]] = {}
+        for name in settings.metrics:
+            of_network, of_tracks = name.endswith("lpips"), METRICS[name].inputs == "track"
+            kind = "LPIPS" if of_network else "metrics of points" if of_tracks else "other metrics, with masks"
+            parts.setdefault(kind, []).append(name)
+        for kind, names in parts.items():
+            with timed(seconds, kind):
+                grades = grade_video(comparison, names)
+        with timed(seconds, "writing"):
+            settings.store.write(job.cell, grades)
+    return seconds
+
+
+@contextmanager
+def timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
+    start = time.perf_counter()
+    yield
+    seconds[stage] = time.perf_counter() - start
 
 
 def environment(processes: str) -> dict[str, str]:
