@@ -73,10 +73,8 @@ def main(args: Args) -> None:
     print(f"{platform.processor()}, {os.cpu_count()} cores; {count} episodes")
     first: pd.Series[Any] | None = None
     fastest = 0.0
-    print(
-        "| estimators | processes | first time [s] | again [s] | first video [s] | processor time [s] | factor | videos/s | model only [s] |"
-    )
-    print("|---" * 9 + "|")
+    titles = ["first time [s]", "again [s]", "first video [s]", "processor time [s]", "factor", "videos/s", "model only [s]"]
+    print("| " + " | ".join(["estimators", "processes", *titles]) + " |\n" + "|---" * 9 + "|")
     for way in args.ways:
         estimators, processes = way.split(":")
         cold, _, _ = grade(args, estimators, processes)

@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 
 from xew.concurrency import (
-    count_done,
     free_gpu_memory,
     leave_with_parent,
     map_in_order,
     map_in_processes,
     map_with_shared_memory,
+    queue_to,
 )
 from xew.episode import EpisodeError
 
@@ -262,9 +262,9 @@ def test_small_results_need_no_shared_memory() -> None:
     assert [text for text, _ in found] == [os.environ["HOME"], os.environ["PATH"]]
 
 
-def test_what_processes_put_is_counted_until_the_end() -> None:
-    done: list[None] = []
-    with count_done(lambda: done.append(None)) as queue:
-        for _ in range(3):
-            queue.put(True)
-    assert len(done) == 3
+def test_what_processes_put_is_received_until_the_end() -> None:
+    received: list[int] = []
+    with queue_to(received.append) as queue:
+        for number in range(3):
+            queue.put(number)
+    assert received == [0, 1, 2]

@@ -175,10 +175,10 @@ def map_in_processes(
 
 
 @contextmanager
-def count_done(done: Callable[[], object]) -> Iterator["SimpleQueue[Any]"]:
-    """Yield a queue for `open_processes`; in another thread, `done` is called for everything that processes put into it."""
+def queue_to(receive: Callable[[Any], object]) -> Iterator["SimpleQueue[Any]"]:
+    """Yield a queue for `open_processes`; in another thread, `receive` is called with everything that processes put into it."""
     queue = multiprocessing.get_context("forkserver").SimpleQueue()
-    follower = threading.Thread(target=lambda: [done() for _ in iter(queue.get, None)])
+    follower = threading.Thread(target=lambda: [receive(item) for item in iter(queue.get, None)])
     follower.start()
     try:
         yield queue

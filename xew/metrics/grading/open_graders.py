@@ -18,11 +18,11 @@ from tqdm import tqdm
 
 from xew.compilation import keep_compiled_programs, take_memory_as_needed
 from xew.concurrency import (
-    count_done,
     free_gpu_memory,
     map_in_order,
     map_in_processes,
     prepare_processes,
+    queue_to,
     usable_cores,
     visible_gpus,
 )
@@ -88,7 +88,7 @@ def grade_groups(
         warm_up(settings, [job for group in groups for job, _ in group], gpus)
     if processes > 1:
         _start_imports()
-        with count_done(done) as queue:
+        with queue_to(lambda _: done()) as queue:
             opener = functools.partial(_open_in_process, settings, queue)
             yield from map_in_processes(opener, split_groups(groups, processes), processes, IMPORTED, gpus)
         return
