@@ -102,7 +102,7 @@ def warm_up(settings: GradingSettings, jobs: Sequence[Job], gpus: Sequence[str])
     parts = missing_parts(settings, jobs)
     if not parts:
         return
-    print(f"compiles {len(parts)} parts of the GPU's kernels and programs, once for this machine; then grades", flush=True)
+    print(f"kernels and programs for the GPU are compiled once on this machine, in {len(parts)} parts", flush=True)
     opener = functools.partial(_open_compiler, settings.args.trust)
     compiled = map_in_processes(opener, parts, min(len(parts), usable_cores()), IMPORTED, gpus)
     for _ in tqdm(compiled, desc="compile", unit="part", total=len(parts), disable=None, leave=False):

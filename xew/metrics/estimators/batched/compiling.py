@@ -34,14 +34,19 @@ OF_SURFACES = tuple(name for name in THREADS if name.startswith(_RENDERING))
 
 def missing_kernels(modules: Iterable[str]) -> list[str]:
     """The modules, keys of THREADS, that Warp's cache lacks for this machine's GPUs."""
-    wp.config.log_level = wp.LOG_ERROR
-    archs = {gpu.arch for gpu in wp.get_cuda_devices()}
+    archs = {gpu.arch for gpu in _gpus()}
     return [name for name in dict.fromkeys(modules) if not all(is_compiled(name, arch) for arch in archs)]
 
 
 def gpu_names() -> list[str]:
     """Names of this machine's kinds of GPUs."""
-    return sorted({gpu.name for gpu in wp.get_cuda_devices()})
+    return sorted({gpu.name for gpu in _gpus()})
+
+
+def _gpus() -> list[wp.Device]:
+    """All GPUs; a context is not made."""
+    wp.config.log_level = wp.LOG_ERROR  # no banner among the progress bars
+    return list(wp.get_cuda_devices())
 
 
 def is_compiled(module: str, arch: int) -> bool:
