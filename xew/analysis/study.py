@@ -103,8 +103,9 @@ def run_steps(args: Args, steps: Mapping[str, Step], ledger: Ledger) -> dict[str
     """Run what is left and wanted, within a time if there is one; returns the steps that failed, with the reason."""
     study, machines = args.study, open_machines(args.study)
     print(format_status(study, steps, ledger), format_cost(study, steps, ledger, machines.slots), sep="\n\n", flush=True)
-    seconds = correct_by_ledger(estimate(study, steps), steps, ledger)
-    budget = None if args.minutes is None else Budget(study, steps, ledger, 60 * args.minutes)
+    slots = max(1, machines.slots)
+    seconds = correct_by_ledger(estimate(study, steps), steps, ledger, slots)
+    budget = None if args.minutes is None else Budget(study, steps, ledger, 60 * args.minutes, slots)
     return StudyRunner(study, steps, ledger, machines, critical_paths(steps, seconds), budget, args.only).run()
 
 
