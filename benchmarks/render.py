@@ -1,10 +1,12 @@
 """How long a frame takes: our two fused passes, and the same outputs by Newton's SensorCamera, same scenes, same run.
 
     python -m benchmarks.render [--device cpu|cuda:0] [--frames N] [--workloads 2] [--pictures DIR]
+                                [--cameras head wrist_left] [--size 640x480]
 
-The workload is what an episode needs, 320x240: the scene (two Panda arms and three things over the table, color with
-anti-aliasing and shadows, robot mask, visibility of keypoints) and the robot alone by its commands (color, mask, exact
-optical flow). It is drawn with capsules for links, with the robot's own meshes, and with meshes of 2,000 triangles a link.
+The workload is what an episode needs from each camera, 320x240 unless --size says otherwise: the scene (two Panda arms and
+three things over the table, color with anti-aliasing and shadows, robot mask, visibility of keypoints) and the robot alone by
+its commands (color, mask, exact optical flow). It is drawn with capsules for links, with the robot's own meshes, and with
+meshes of 2,000 triangles a link.
 SensorCamera is called once for each of the two: color (MSAA 4; in the scene with the shadows of one light, where ours has
 three), shape index for the mask, and depth, from which visibility and flow would have to be computed; that is not timed.
 Capsules are primitives to it and triangles to us. "kernels" is the time on the device, "with copies" until all images are on
@@ -14,7 +16,7 @@ the host; on a CPU the two are one. Before a figure is printed, the silhouettes 
 import time
 from collections import defaultdict
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -28,8 +30,9 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.common import format_versions, intersection_over_union, label_picture
 from xew.protocol import ARMS
+from xew.sim_warp.cameras import fix_camera, get_camera, place_camera
 from xew.sim_warp.geometry import meshes
-from xew.sim_warp.geometry.camera import HEAD_CAMERA
+from xew.sim_warp.geometry.camera import Camera
 from xew.sim_warp.geometry.meshes import Color, Mesh
 from xew.sim_warp.rendering.bodies import robot_bodies, robot_pose
 from xew.sim_warp.rendering.observe import keypoint_positions
@@ -70,6 +73,10 @@ class Args:
     """Folder for pictures of both side by side, one a workload."""
     workloads: tuple[int, ...] = (0, 1, 2)
     """0 capsules, 1 the robot's own meshes, 2 meshes of 2,000 triangles a link."""
+    cameras: tuple[str, ...] = ("head",)
+    """Names of cameras, or files of custom ones."""
+    size: str | None = None
+    """Pixels of a picture, such as 640x480; default: each camera's own."""
 
 
 @dataclass(frozen=True)
@@ -116,6 +123,8 @@ class Workload:
     """[t b 7] of robot and things."""
     points: np.ndarray
     """[t k 3] keypoints."""
+    camera: Camera
+    """With one pose, or one for each frame."""
 
     @property
     def scene(self) -> World:
@@ -126,8 +135,8 @@ class Workload:
         return World([thing.body for thing in self.robot], self.robot_pose)
 
 
-def workloads() -> list[Workload]:
-    """Both hands at work over the table."""
+def workloads(camera_name: str, size: str | None) -> list[Workload]:
+    """Both hands at work over the table, before a camera."""
     robot = ROBOTS["franka_panda"]
     action = np.zeros((FRAMES_PER_WORLD, 16))
     share = np.linspace(0, 1, FRAMES_PER_WORLD)[:, None]
@@ -135,6 +144,7 @@ def workloads() -> list[Workload]:
         action[:, joints] = (1 - share) * start + share * end
         action[:, gripper] = 1.0
     pose, points = robot_pose(robot, action), keypoint_positions(robot, action)
+    camera = place_camera(fix_camera(get_camera(camera_name, size), robot), robot, action)
     thing_pose = np.tile([0.0, 0, 0, 0, 0, 0, 1], (FRAMES_PER_WORLD, 3, 1))
     thing_pose[..., :3] = ((-0.1, -0.1, 0.77), (0.15, 0.1, 0.78), (0.02, -0.05, 0.795))
     together = np.concatenate([pose, thing_pose], 1)
@@ -148,7 +158,7 @@ def workloads() -> list[Workload]:
         "own meshes": [Thing(mesh, True) for mesh in links],
         f"{PER_LINK} triangles a link": [Thing(refine(mesh, PER_LINK), True) for mesh in links],
     }
-    return [Workload(name, parts, things, pose, together, points) for name, parts in drawn.items()]
+    return [Workload(name, parts, things, pose, together, points, camera) for name, parts in drawn.items()]
 
 
 def main_color(mesh: Mesh) -> Color:
@@ -199,19 +209,25 @@ def _quarter(corners: np.ndarray) -> np.ndarray:
 
 
 def scene_pass(renderer: Renderer, work: Workload, worlds: int) -> list[Frames]:
-    return renderer.render_batch([work.scene] * worlds)
+    return renderer.render_batch([work.scene] * worlds, repeat_camera(work.camera, worlds))
 
 
 def command_pass(renderer: Renderer, work: Workload, worlds: int) -> list[Frames]:
-    return renderer.render_batch([work.command] * worlds, ground=False, optical_flow=True)
+    return renderer.render_batch([work.command] * worlds, repeat_camera(work.camera, worlds), ground=False, optical_flow=True)
 
 
-def check(scene: Frames, command: Frames) -> None:
+def repeat_camera(camera: Camera, worlds: int) -> Camera:
+    """The camera for several worlds: one that moves has a pose for each frame of all."""
+    return replace(camera, extrinsics=np.tile(camera.extrinsics, (worlds, 1, 1))) if camera.moves else camera
+
+
+def check(scene: Frames, command: Frames, camera: Camera) -> None:
     """The workload is what it says: robot and keypoints are there, and something moves."""
-    assert scene.rgb.shape == command.rgb.shape == (FRAMES_PER_WORLD, 240, 320, 3)
+    assert scene.rgb.shape == command.rgb.shape == (FRAMES_PER_WORLD, camera.height, camera.width, 3)
     assert scene.robot_mask.mean() > 0.05 and command.robot_mask.mean() > 0.05
-    assert (scene.point_body >= 0).any() and scene.point_depth.max() > 0.5
-    assert (np.linalg.norm(command.optical_flow[0], axis=-1) > 0.5).mean() > 0.03
+    if not camera.moves:  # a hand stands still before its own camera and hides its keypoints
+        assert (scene.point_body >= 0).any() and scene.point_depth.max() > 0.5
+        assert (np.linalg.norm(command.optical_flow[0], axis=-1) > 0.5).mean() > 0.02
 
 
 # ---- SensorCamera's
@@ -253,10 +269,19 @@ def _vertex_normals(mesh: Mesh) -> np.ndarray:
     return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
 
 
-class Sensor:
-    """SensorCamera at the head camera's place, one world a view."""
+def _sensor_place(extrinsics: np.ndarray) -> wp.transformf:
+    """Pose of a SensorCamera, which looks along -z with y up; `extrinsics` [4 4] from world to camera."""
+    rotation = extrinsics[:3, :3].T @ np.diag([1.0, -1.0, -1.0])
+    position = -extrinsics[:3, :3].T @ extrinsics[:3, 3]
+    return wp.transform(wp.vec3(*position), wp.quat_from_matrix(wp.mat33(*rotation.ravel())))
 
-    def __init__(self, things: list[Thing], pose: np.ndarray, with_stage: bool, views: int, device: str) -> None:
+
+class Sensor:
+    """SensorCamera at a camera's place, one world a view."""
+
+    def __init__(
+        self, things: list[Thing], pose: np.ndarray, camera: Camera, with_stage: bool, views: int, device: str
+    ) -> None:
         self.things, self.device = len(things) * views, device
         self.model = newton_model(things, with_stage, views, device)
         self.state = self.model.state()
@@ -264,13 +289,13 @@ class Sensor:
         config = SensorCamera.RenderConfig(enable_shadows=with_stage, anti_aliasing=SensorCamera.AntiAliasing.MSAA)
         self.camera = SensorCamera(self.model, default_render_config=config)
         self.camera.create_default_light(direction=wp.vec3(0.0, 0.447, -0.894), color=(LIGHT, LIGHT, LIGHT))
-        fov = float(2 * np.arctan(HEAD_CAMERA.height / 2 / HEAD_CAMERA.intrinsics[1, 1]))
-        size = HEAD_CAMERA.width, HEAD_CAMERA.height
+        fov = float(2 * np.arctan(camera.height / 2 / camera.intrinsics[1, 1]))
+        size = camera.width, camera.height
         self.rays = SensorCamera.compute_camera_rays_pinhole(*size, camera_fov=fov, sample_count=4, device=device)
-        # SensorCamera looks along -z with y up
-        rotation = HEAD_CAMERA.extrinsics[:3, :3].T @ np.diag([1.0, -1.0, -1.0])
-        place = wp.transform(wp.vec3(*HEAD_CAMERA.position), wp.quat_from_matrix(wp.mat33(*rotation.ravel())))
-        self.places = wp.array([place] * views, dtype=wp.transformf, device=device)
+        poses = np.broadcast_to(camera.extrinsics, (len(pose), 4, 4))
+        self.places = wp.array(
+            [_sensor_place(poses[view % len(poses)]) for view in range(views)], dtype=wp.transformf, device=device
+        )
         self.color = self.camera.allocate_image_color(views, *size)
         self.shape_index = self.camera.allocate_image_shape_index(views, *size)
         self.depth = self.camera.allocate_image_depth_forward(views, *size)
@@ -359,15 +384,15 @@ def race(work: Workload, renderer: Renderer, worlds: int, pictures: Path | None)
     device = renderer.device.alias
     count, views = worlds * FRAMES_PER_WORLD, VIEWS["cuda" if renderer.device.is_cuda else "cpu"]
     scene, command = scene_pass(renderer, work, 1)[0], command_pass(renderer, work, 1)[0]
-    check(scene, command)
+    check(scene, command, work.camera)
     triangles = [sum(len(thing.mesh.triangles) for thing in part) for part in (work.robot, work.things)]
     print(f"\n{work.name}: robot of {triangles[0]} and things of {triangles[1]} triangles, {len(work.robot)} links")
     fused = our_cost("scene", lambda: scene_pass(renderer, work, worlds), count)
     fused += our_cost("robot alone", lambda: command_pass(renderer, work, worlds), count)
-    whole = Sensor([*work.robot, *work.things], work.pose, True, views, device)
-    alone = Sensor(work.robot, work.robot_pose, False, views, device)
+    whole = Sensor([*work.robot, *work.things], work.pose, work.camera, True, views, device)
+    alone = Sensor(work.robot, work.robot_pose, work.camera, False, views, device)
     seen = {"scene": whole.picture(), "robot alone": alone.picture()}
-    own = renderer.render_batch([work.scene], body=True)[0].body[0] >= 0
+    own = renderer.render_batch([work.scene], work.camera, body=True)[0].body[0] >= 0
     pairs = (own, seen["scene"][1]), (command.robot_mask[0], seen["robot alone"][1])
     same = [intersection_over_union(*pair) for pair in pairs]
     assert min(same) > AGREEMENT, f"the silhouettes agree only to {same[0]:.3f} and {same[1]:.3f}"
@@ -399,8 +424,11 @@ def main(args: Args) -> None:
     print(f"{device.name} ({device.alias})")
     print(format_versions(PACKAGES))
     renderer = Renderer(device.alias)
-    for work in (workloads()[number] for number in args.workloads):
-        race(work, renderer, worlds, args.pictures)
+    for name in args.cameras:
+        found = workloads(name, args.size)
+        for work in (found[number] for number in args.workloads):
+            print(f"\ncamera {name}, {work.camera.width}x{work.camera.height}")
+            race(work, renderer, worlds, args.pictures)
 
 
 if __name__ == "__main__":
