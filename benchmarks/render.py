@@ -135,7 +135,7 @@ class Workload:
         return World([thing.body for thing in self.robot], self.robot_pose)
 
 
-def workloads(camera_name: str, size: str | None) -> list[Workload]:
+def workloads(camera_name: str = "head", size: str | None = None) -> list[Workload]:
     """Both hands at work over the table, before a camera."""
     robot = ROBOTS["franka_panda"]
     action = np.zeros((FRAMES_PER_WORLD, 16))
