@@ -36,6 +36,7 @@ import xew
 from benchmarks.common import check_episodes
 from benchmarks.utilization import Use, run_sampled
 from xew.analysis.studies.rates import Rate, Rates, rates_path, write_rates
+from xew.analysis.study import stop_on_sigterm
 from xew.concurrency import visible_gpus
 from xew.dataset import read_dataset
 from xew.files import read_json, write_text
@@ -317,7 +318,8 @@ class Pipeline:
         variables = os.environ | ({"CUDA_VISIBLE_DEVICES": ",".join(self.part.gpus)} if self.part.gpus else {})
         command = [sys.executable, "-m", *self.command(step)]
         try:
-            return run_sampled(command, log, variables, self.part.cores, self.part.gpus)
+            with stop_on_sigterm():  # the command ends, too
+                return run_sampled(command, log, variables, self.part.cores, self.part.gpus)
         except subprocess.CalledProcessError as error:
             raise SystemExit(f"{step} ended with {error.returncode}: {log.read_text()[-2000:]}") from error
 

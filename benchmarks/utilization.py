@@ -30,16 +30,16 @@ def run_sampled(
 ) -> Use:
     """Run a command on some cores and GPUs, its output appended to a log.
 
-    Raises subprocess.CalledProcessError if it fails. Its processes are those of its session.
+    Raises subprocess.CalledProcessError if it fails.
     """
     read_gpus, source = open_gpus(gpus)
-    busy: dict[tuple[str, str], float] = {}
+    busy: dict[tuple[int, str], float] = {}
     samples: list[float] = []
     allowed = os.sched_getaffinity(0)
     with log.open("a", encoding="utf-8") as file:
         os.sched_setaffinity(0, cores)  # the command inherits it
         begin = time.perf_counter()
-        process = subprocess.Popen(command, stdout=file, stderr=file, env=environment, start_new_session=True)
+        process = subprocess.Popen(command, stdout=file, stderr=file, env=environment)
         os.sched_setaffinity(0, allowed)
         try:
             while process.poll() is None:
@@ -57,17 +57,17 @@ def run_sampled(
     return Use(seconds, sum(busy.values()) / seconds / len(cores), gpu, source)
 
 
-def cpu_seconds(session: int) -> dict[tuple[str, str], float]:
-    """CPU time of each process of a session by its number and start, from /proc [s]."""
+def cpu_seconds(root: int) -> dict[tuple[int, str], float]:
+    """CPU time of a process and of its descendants by number and start, from /proc [s]."""
     found = {}
     for path in Path("/proc").glob("[0-9]*/stat"):
-        try:
-            fields = path.read_text(errors="replace").rpartition(")")[2].split()
-        except OSError:  # it has ended
-            continue
-        if int(fields[3]) == session:
-            found[path.parent.name, fields[19]] = TICK_S * (int(fields[11]) + int(fields[12]))
-    return found
+        with contextlib.suppress(OSError):  # it has ended
+            found[int(path.parent.name)] = path.read_text(errors="replace").rpartition(")")[2].split()
+    family, added = set[int](), {root} & found.keys()
+    while added:
+        family |= added
+        added = {number for number, fields in found.items() if int(fields[1]) in added}
+    return {(number, found[number][19]): TICK_S * sum(map(int, found[number][11:13])) for number in family}
 
 
 def open_gpus(gpus: Sequence[str]) -> tuple[Callable[[], list[float]], str]:

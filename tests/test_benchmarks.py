@@ -210,10 +210,13 @@ def test_the_peer_of_the_model_runs(tmp_path: Path, capsys: pytest.CaptureFixtur
 def test_a_command_is_sampled_with_its_cores(tmp_path: Path) -> None:
     core = min(node.find_parts()["all"].cores)
     lines = ["import os, time", "print(sorted(os.sched_getaffinity(0)), flush=True)", "end = time.perf_counter() + 1.2"]
-    program = "\n".join([*lines, "while time.perf_counter() < end:", "    pass"])
-    use = utilization.run_sampled([sys.executable, "-c", program], tmp_path / "log", {}, [core], [])
+    lines += ["while time.perf_counter() < end:", "    pass"]
+    use = utilization.run_sampled([sys.executable, "-c", "\n".join(lines)], tmp_path / "log", {}, [core], [])
     assert (tmp_path / "log").read_text() == f"[{core}]\n" and use.seconds > 1.2
     assert 0.02 < use.cpu <= 1.05 and use.gpu is None and use.gpu_source == "no GPU is used"
+    program = "import subprocess, sys; subprocess.run([sys.executable, '-c', sys.argv[1]])"
+    use = utilization.run_sampled([sys.executable, "-c", program, "\n".join(lines)], tmp_path / "log", {}, [core], [])
+    assert use.cpu > 0.02, "work of a child counts"
     with pytest.raises(subprocess.CalledProcessError):
         utilization.run_sampled([sys.executable, "-c", "raise SystemExit(3)"], tmp_path / "log", {}, [core], [])
 

@@ -1,6 +1,6 @@
 """Measured rates of the steps of a study: of this machine, as `benchmarks/node.py` writes them, else documented ones.
 
-    ~/.cache/xew/rates.json           of this machine ($XDG_CACHE_HOME); another file by `study --rates`
+    ~/.cache/xew/rates.json           of this machine ($XDG_CACHE_HOME); another file by `study --machine.rates`
     xew/analysis/studies/rates.json   documented ones, with their source
 
 Both hold for each network size one entry for a part of the machine and one for all of it.
