@@ -81,9 +81,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         check_configs([study.experiment])
         slots = len(usable_gpus(study)) or study.machine.workers
         print(format_status(study, steps, ledger), format_cost(study, steps, ledger, slots), sep="\n\n")
-        earlier = args.scores or study.out / "scores.parquet"
-        if args.scores or earlier.exists():
-            print(f"\n{format_power(earlier)}")
+        print(describe_power(args))
         return
     with lock_study(study.out), stop_on_sigterm():
         prepare(study)
@@ -97,6 +95,19 @@ def main(arguments: Sequence[str] | None = None) -> None:
         exit_with_failures(failed, ledger, steps)
     left = [name for name in steps if not ledger.outcome(name)]
     print(f"{len(left)} steps are left" if left else f"report: {study.out / 'report' / 'index.html'}")
+
+
+def describe_power(args: Args) -> str:
+    """Text on the power of an earlier study's scores, or of the study's own. Raises ConfigError for scores that are named."""
+    own = args.study.out / "scores.parquet"
+    if args.scores is None and not own.exists():
+        return ""
+    try:
+        return f"\n{format_power(args.scores or own)}"
+    except ConfigError as error:
+        if args.scores is not None:
+            raise
+        return f"\n{error}"
 
 
 def run_steps(args: Args, steps: Mapping[str, Step], ledger: Ledger) -> dict[str, str]:

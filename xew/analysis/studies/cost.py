@@ -202,8 +202,8 @@ def format_costs(
     lines.append(f"{total}{f'{totals[1]:.2f}' if on_gpus else '':>11}{totals[2]:>8.1f}")
     gpus = f"{slots} GPU{'s' if slots > 1 else ''}"
     places = f"{gpus} and {shared} steps on each" if shared > 1 else gpus if on_gpus else f"{slots} at once"
-    corrected = ", corrected by the steps that are done" if done else ""
-    lines.append(f"about {format_duration(wall)} with {places}, by {study_rates(study).text}{corrected}")
+    own = "the steps that are done and " if done else ""
+    lines.append(f"about {format_duration(wall)} with {places}, by {own}{study_rates(study).text}")
     free = free_gb(study.out)
     if free < totals[2]:
         lines.append(f"WARNING: {totals[2]:.1f} GB are needed and {free:.1f} GB are free under {study.out}")
