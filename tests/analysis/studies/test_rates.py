@@ -8,14 +8,14 @@ import pytest
 
 from tests.analysis.studies.chains import ROOT
 from xew.analysis.studies import rates as module
-from xew.analysis.studies.config import load_study
+from xew.analysis.studies.config import Settings, load_study
 from xew.analysis.studies.cost import estimate, estimate_wall_seconds
 from xew.analysis.studies.ledger import Ledger
 from xew.analysis.studies.plan import Step, count_gpus, count_sharing, plan
 from xew.analysis.studies.rates import DOCUMENTED, Rate, Rates, find_rates, join_rates, read_rates, write_rates
 from xew.analysis.studies.runner import StudyRunner
 from xew.analysis.study import main
-from xew.config import ConfigError
+from xew.config import ConfigError, merge_settings
 
 ONE = Rates("one card", "today", 1, {"rollout": Rate(30, 0.8), "train": Rate(60, 0.02)})
 FOUR = Rates("four cards", "today", 4, {"rollout": Rate(20, 0.2), "train": Rate(60, 0.01)})
@@ -46,6 +46,8 @@ def test_measured_rates_win_and_the_line_says_whose_they_are(tmp_path: Path, mon
     assert found.text.startswith("the rates of: one card and four cards (today); analyse, baselines, distances, evaluate")
     assert "nothing of size wan5b" in find_rates("wan5b").text
     assert find_rates("small", path) == found and read_rates(path)["tiny"] == (ONE,)
+    write_rates(path, "tiny", [replace(ONE, kinds={"train": Rate(1, 2)})])
+    assert read_rates(path)["tiny"][0].kinds == ONE.kinds | {"train": Rate(1, 2)}, "what was not measured again stays"
 
 
 @pytest.mark.parametrize("text", ["", "[]", '{"small": [{"machine": "x"}]}', '{"small": [{"gpus": "many"}]}'])
@@ -95,6 +97,26 @@ def test_training_runs_share_free_gpus_evenly(left: str, gpus: list[int]) -> Non
             free -= given[-1]
             waiting.remove(name)
     assert given == gpus
+
+
+@pytest.mark.parametrize(
+    ("settings", "machine", "planned", "alone"),
+    [
+        ({}, {}, 1, 4),
+        ({"train": {"batch": 8}}, {}, 1, 8),
+        ({"train": {"batch": 8, "accumulate": 2}}, {}, 1, 4),
+        ({"mesh": {"fsdp": 2}}, {}, 2, 4),
+        ({"mesh": {"data": 1, "fsdp": 2}}, {}, 2, 2),
+        ({}, {"gpus_per_training": 2}, 2, 2),
+        ({}, {"train_launcher": "srun"}, 1, 1),
+    ],
+)
+def test_a_run_takes_what_its_mesh_and_batch_allow(settings: Settings, machine: Settings, planned: int, alone: int) -> None:
+    """On eight GPUs, alone; the recipe's batch is four."""
+    study = load_study(ROOT / "configs" / "study_small.yaml")
+    changed = replace(study, settings=merge_settings(study.settings, settings), machine=replace(study.machine, **machine))
+    step = plan(changed)["train/fixed-joints-none"]
+    assert (step.gpus_of(8), count_gpus(step, 8, 8, 1)) == (planned, alone)
 
 
 def test_runs_that_wait_for_a_run_have_no_share_yet() -> None:

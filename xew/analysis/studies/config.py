@@ -41,8 +41,13 @@ _KNOWN_ROBOTS = tuple(
 Settings = dict[str, Any]
 """A part of an experiment's config, nested as in its file."""
 
-RECIPE: Settings = {"clip": {"frames": 33}, "model": {"size": "small"}, "train": {"batch": 4, "steps": 7500}}
-"""Defaults of xew.model's experiments, which the analysis does not import, as far as costs depend on them."""
+RECIPE: Settings = {
+    "clip": {"frames": 33},
+    "model": {"size": "small"},
+    "train": {"batch": 4, "steps": 7500, "accumulate": 1},
+    "mesh": {"data": -1, "fsdp": 1},
+}
+"""Defaults of xew.model's experiments, which the analysis does not import, as far as costs and devices depend on them."""
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ distances _____________________________________________________________|
 
 import hashlib
 import json
+import math
 import shlex
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -47,7 +48,7 @@ class Step:
     may_spread: bool = False
     """Whether it takes more than `gpus` if others leave them free (`count_gpus`)."""
     batch: int = 0
-    """Number that its number of GPUs must divide; 0 for none."""
+    """Number that a larger number of GPUs must divide; 0 for none."""
     launcher: tuple[str, ...] = ()
     environment: Mapping[str, str] = field(default_factory=dict)
     after: tuple[str, ...] = ()
@@ -93,7 +94,7 @@ def count_sharing(
 
 
 def count_gpus(step: Step, total: int, free: int, among: int) -> int:
-    """Number of GPUs that a step takes of a machine: as planned, or its share of the free ones if it may spread.
+    """Number of GPUs that a step takes of a machine: as planned, or a multiple within its share of the free ones.
 
     Args:
         step: the step that starts.
@@ -104,7 +105,8 @@ def count_gpus(step: Step, total: int, free: int, among: int) -> int:
     planned = min(max(1, step.gpus_of(total)), total)
     if not step.may_spread or among == 0:
         return planned
-    return next(count for count in range(max(planned, free // among), 0, -1) if step.batch % count == 0)
+    counts = range(max(planned, free // among), planned, -1)
+    return next((count for count in counts if count % planned == 0 == step.batch % count), planned)
 
 
 def plan(study: Study) -> dict[str, Step]:
@@ -204,6 +206,8 @@ def _training_name(variant: Variant) -> str:
 def _plan_train(study: Study, variant: Variant, experiment: Settings) -> Step:
     joins = ("--distributed",) if study.machine.train_launcher else ()
     before = (_training_name(variant.start),) if variant.start is not None else ()
+    settings = merge_settings(RECIPE, experiment)
+    mesh = settings["mesh"].values()
     return Step(
         _training_name(variant).partition("/")[0],
         variant.name,
@@ -211,9 +215,9 @@ def _plan_train(study: Study, variant: Variant, experiment: Settings) -> Step:
         needs=(f"latents/{variant.name}", *before),
         inputs=_training_inputs(experiment),
         product=run_folder(study, variant),
-        gpus=study.machine.gpus_per_training or 1,
-        may_spread=study.machine.gpus_per_training is None and not study.machine.train_launcher,
-        batch=_divisible_batch(experiment),
+        gpus=study.machine.gpus_per_training or math.prod(size for size in mesh if size > 0),
+        may_spread=study.machine.gpus_per_training is None and -1 in mesh and not study.machine.train_launcher,
+        batch=settings["train"]["batch"] // settings["train"]["accumulate"],
         launcher=tuple(shlex.split(study.machine.train_launcher)),
     )
 
@@ -352,12 +356,6 @@ def _plan_analyse(study: Study, needs: tuple[str, ...]) -> Step:
         product=study.out / "report" / "index.html",
         gpus=0,
     )
-
-
-def _divisible_batch(experiment: Settings) -> int:
-    """Number of samples that the GPUs of a training run share evenly."""
-    train = merge_settings(RECIPE, experiment)["train"]
-    return int(train["batch"]) // int(train.get("accumulate", 1))
 
 
 def _training_inputs(experiment: Settings) -> Settings:

@@ -9,7 +9,7 @@ Both hold for each network size one entry for a part of the machine and one for 
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from xew.config import CONVERTER, ConfigError, parse
@@ -106,9 +106,11 @@ def read_rates(path: Path) -> dict[str, tuple[Rates, ...]]:
 
 
 def write_rates(path: Path, size: str, entries: Sequence[Rates]) -> None:
-    """Replace the entries of one network size in a file of rates."""
-    others = read_json(path) if path.is_file() else {}
-    content = others | {size: [CONVERTER.unstructure(entry) for entry in entries]}
+    """Replace the entries of one network size in a file of rates. Kinds of steps that were not measured stay as they were."""
+    content = read_json(path) if path.is_file() else {}
+    before = {entry.gpus: entry.kinds for entry in read_rates(path).get(size, ())} if content else {}
+    merged = [replace(entry, kinds=before.get(entry.gpus, {}) | entry.kinds) for entry in entries]
+    content[size] = [CONVERTER.unstructure(entry) for entry in merged]
     path.parent.mkdir(parents=True, exist_ok=True)
     write_text(path, json.dumps(content, indent=1) + "\n", within=path.parent)
 
