@@ -35,7 +35,7 @@ MAY_IMPORT: dict[str, set[str]] = {
 """Rooms that a room may import; '' are the files at the root. All may import those and GROUND."""
 GROUND = {"", "statistics", "video"}
 LAZILY = {
-    ("model", "sim_warp"): ("conditions", "latents", "cache", "episodes", "sampling.reading", "video"),
+    ("model", "sim_warp"): ("conditions", "latents", "cache", "episodes", "devices.parts", "video"),
     ("model", "metrics"): ("codecs.ceiling", "conditions", "training.samples", "weights.reading"),
     ("metrics", "sim_warp"): ("truth",),
 }

@@ -30,7 +30,7 @@ from xew.protocol import SHARED_MOTION, expand_robots
 from xew.sim_warp.devices.workers import Workers, find_devices, quiet_warp, worker_count
 from xew.sim_warp.production.cells import Job, plan_cells, simulate_cells
 from xew.sim_warp.production.episodes import header
-from xew.sim_warp.production.warm_up import compile_kernels
+from xew.sim_warp.production.warm_up import compile_on_devices
 from xew.sim_warp.robots import ROBOTS, RobotSpec, get_robot
 from xew.sim_warp.tasks import TASKS, Task, get_task
 
@@ -89,7 +89,7 @@ def attempt_seeds(args: Args) -> Iterator[list[Record]]:
     batches = [jobs[start : start + size] for start in range(0, len(jobs), size)]
     attempt = partial(attempt_batch, batch=args.batch, robots=robots)
     with Workers(args.workers or worker_count(devices), devices) as workers:
-        compile_kernels(workers, devices[0], args.batch, ("physics", "kinematics"))
+        compile_on_devices(workers, dict.fromkeys(("physics", "kinematics"), devices[0].alias), args.batch)
         for seeds in workers.run(attempt, batches):
             yield from seeds
 

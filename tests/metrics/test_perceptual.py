@@ -21,7 +21,7 @@ from xew.metrics import (
     robot_lpips,
     robot_lpips_frames,
 )
-from xew.metrics.grading.weights import check_weights
+from xew.metrics.grading.settings import check_weights
 from xew.metrics.networks import alexnet
 from xew.metrics.networks.alexnet import ADMITTED, _package_file, read_alexnet
 from xew.metrics.networks.pickles import read_arrays

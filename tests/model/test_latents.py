@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 import pytest
 from safetensors.numpy import load_file, save_file
@@ -17,12 +18,14 @@ from xew.config import ConfigError
 from xew.dataset import find_accepted
 from xew.episode import EpisodeError, read_record, write_video
 from xew.model import latents
+from xew.model.cache import encode
 from xew.model.cache.clips import needed_pixels
-from xew.model.cache.encode import encode_many
+from xew.model.cache.encode import encode_episodes, encode_many
 from xew.model.cache.store import open_cache
 from xew.model.codecs.autoencoders import ConvAutoencoderCodec
 from xew.model.codecs.contract import CodecSettings
 from xew.model.conditions import Command
+from xew.model.devices import parts
 from xew.model.experiment import load_experiment
 from xew.model.video.pixels import stored_pixels
 
@@ -100,6 +103,44 @@ def test_processes_encode_as_one_does(simulated: Path, tmp_path: Path) -> None:
     encoded = {processes: files(tmp_path / processes / "data-latents") for processes in ("1", "2")}
     assert len([name for name in encoded["1"] if name.endswith(".safetensors")]) == 3
     assert encoded["2"] == encoded["1"]
+
+
+def test_gpus_share_the_episodes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A process a GPU encodes, and two read for each; GPUs are names here. Latents are those of one process with threads."""
+    encoded, written = [], []
+    for gpus in ((), ("4", "7")):
+        root = tmp_path / str(len(gpus))
+        synthetic.write_synthetic_data(root / "data", seeds=(0, 1, 2), robots=("arx_x5",), frames=7)
+        monkeypatch.setattr(encode, "visible_gpus", lambda gpus=gpus: gpus)
+        monkeypatch.setattr(jax, "default_backend", lambda gpus=gpus: "gpu" if gpus else "cpu")
+        cache = open_cache(load_experiment(Path(write_config(root))).encoding)
+        written.append(encode_episodes(cache, find_accepted(root / "data"), processes=2 if gpus else 1))
+        assert encode_episodes(cache, find_accepted(root / "data")) == 0
+        encoded.append(files(root / "data-latents"))
+    assert encoded[1] == encoded[0] and len(encoded[0]) == 9
+    assert written[1] == written[0] > 0
+
+
+@pytest.mark.parametrize(
+    ("processes", "cores", "gpus", "episodes", "readers"),
+    [
+        (0, 64, 4, 900, 14),
+        (0, 64, 8, 900, 6),
+        (0, 128, 4, 900, 16),
+        (0, 64, 4, 20, 5),
+        (0, 64, 4, 7, 0),
+        (0, 3, 1, 900, 0),
+        (1, 64, 4, 900, 0),
+        (9, 4, 1, 900, 9),
+    ],
+)
+def test_readers_of_a_gpu_follow_from_cores_and_work(
+    processes: int, cores: int, gpus: int, episodes: int, readers: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(encode, "usable_cores", lambda: cores)
+    monkeypatch.setattr(parts, "free_gpu_memory", lambda _: (78.0,))
+    assert encode.count_readers(processes, episodes, gpus) == readers
 
 
 @pytest.fixture(scope="module")

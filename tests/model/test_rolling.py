@@ -18,6 +18,7 @@ from xew.dataset import Episode
 from xew.episode import EpisodeError, read_record
 from xew.model import rollout
 from xew.model.conditions import CONDITIONS, list_conditions
+from xew.model.devices import parts
 from xew.model.sampling import rolling
 from xew.model.sampling.reading import EpisodeReader
 from xew.model.settings.settings import Clip
@@ -134,9 +135,8 @@ def test_processes_read_for_a_gpu_as_cores_memory_and_work_allow(
     backend: str, cores: int, memory: float, episodes: int, readers: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(jax, "default_backend", lambda: backend)
-    monkeypatch.setattr(rolling, "usable_cores", lambda: cores)
-    monkeypatch.setattr(rolling, "free_gpu_memory", lambda _: (memory,))
-    assert rolling.choose_readers(episodes) == readers
+    monkeypatch.setattr(parts, "free_gpu_memory", lambda _: (memory,))
+    assert parts.choose_readers(episodes, min(rolling.MOST_READERS, cores // 2)) == readers
 
 
 def test_the_latest_checkpoint_is_rolled_out(tmp_path: Path) -> None:

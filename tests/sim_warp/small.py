@@ -71,7 +71,7 @@ class InlineWorkers:
     """Workers that do their jobs in the test's own process: a process of their own imports for several seconds."""
 
     def __init__(self, count: int, devices: Sequence[Any] = ()) -> None:
-        pass
+        self.count = count
 
     def __enter__(self) -> "InlineWorkers":
         return self

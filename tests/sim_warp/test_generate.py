@@ -311,11 +311,20 @@ def test_the_reserved_block_has_the_robots_of_the_test_seeds(tmp_path: Path, mon
         generate(Args(tasks=(TASK,), robots=ROBOTS[:1], test_robots=("piper",), final_seeds=2, out=tmp_path))
 
 
-@pytest.mark.parametrize("physics", [None, "cpu"])
+@pytest.mark.parametrize(
+    ("physics", "cores", "device"),
+    [
+        ("cuda", 64, "cuda:0"),
+        ("cpu", 4, "cpu"),
+        (None, 15, "cuda:0"),
+        (None, 16, "cpu"),
+    ],
+)
 def test_physics_on_the_cpu_leaves_the_gpu_to_the_pictures(
-    physics: Literal["cpu"] | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    physics: Literal["cpu", "cuda"] | None, cores: int, device: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Devices of the jobs and of the compiled kernels."""
+    """Devices of the jobs and of the compiled kernels on a machine with two GPUs."""
+    monkeypatch.setattr(workers, "usable_cores", lambda: cores)
     compiled: dict[str, str] = {}
     productions: list[Production] = []
     gpus = [SimpleNamespace(is_cuda=True, alias=f"cuda:{number}", total_memory=1e12) for number in range(2)]
@@ -327,8 +336,7 @@ def test_physics_on_the_cpu_leaves_the_gpu_to_the_pictures(
     with command.start_workers(args, dict.fromkeys("ab", WITH_SLOW[SLOW])) as make:
         assert list(make([Job(TASK, seed, ("a", "b")) for seed in range(5)])) == []
     (production,) = productions
-    assert production.gpu_physics == (physics is None) and production.batch == 8
-    device = physics or "cuda:0"
+    assert production.gpu_physics == (device != "cpu") and (production.batch, production.gpus) == (8, 2)
     assert compiled == {"physics": device, "kinematics": device, "rendering": "cuda:0"}
 
 
@@ -412,6 +420,13 @@ def test_gpus_have_as_many_workers_as_cores_and_their_memory_allow(
     gpus = [SimpleNamespace(is_cuda=True, total_memory=size * 1e9) for size in gigabytes]
     stepping = gpus[0] if physics == "cuda" else SimpleNamespace(is_cuda=False)
     assert workers.worker_count(cast(Any, gpus), cast(Any, stepping)) == count
+
+
+def test_physics_on_a_gpu_that_is_not_there_is_refused() -> None:
+    devices = [wp.get_device("cpu")]
+    with pytest.raises(ConfigError, match="--physics cuda needs a GPU, and the device is cpu; omit it"):
+        workers.choose_physics("cuda", devices)
+    assert workers.choose_physics(None, devices) == workers.choose_physics("cpu", devices) == devices[0]
 
 
 def test_workers_have_the_gpus_in_turn(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -36,7 +36,7 @@ from xew.files import hold_lock, write_text
 CHECK_CONFIGS = """
 import sys
 from xew.config import user_errors
-from xew.metrics.grading.weights import check_weights
+from xew.metrics.grading.settings import check_weights
 from xew.model.experiment import load_experiment
 user_errors(lambda: [check_weights(), *map(load_experiment, sys.argv[1:])])()
 """

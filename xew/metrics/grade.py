@@ -266,7 +266,8 @@ def _curves_of_features(comparison: Comparison, metrics: Collection[str], inputs
         if whole and _touches_all_borders(arrays[2][0]):  # the box is the whole frame, as it often is
             curves[region] = curves[whole]
         else:
-            curves[region], _ = _feature_distances(comparison, arrays[:2], union_box(arrays[2]))
+            box = union_box(arrays[2][:1])  # of one frame, as all have these pixels: one program for all lengths
+            curves[region], _ = _feature_distances(comparison, arrays[:2], box)
     return curves
 
 

@@ -15,6 +15,7 @@ from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any
 
+import jax
 import numpy as np
 from tqdm import tqdm
 
@@ -23,7 +24,7 @@ from xew.config import ConfigError, user_errors
 from xew.dataset import Dataset, Episode, read_dataset
 from xew.files import hold_lock, read_json, write_text
 from xew.model.cache.clips import gives_render
-from xew.model.cache.encode import default_processes, encode_episodes
+from xew.model.cache.encode import encode_episodes, prepare_for_gpus
 from xew.model.cache.keys import CACHE_VERSION
 from xew.model.cache.scales import keep_scales
 from xew.model.cache.store import LatentCache, load_codec
@@ -52,7 +53,7 @@ class Flags:
     batch: int = 4
     """Number of clips that the codec encodes at once."""
     processes: int = 0
-    """Number of processes; 0 selects one on a CPU and one for every eight cores on a GPU."""
+    """Number of processes that read for each GPU, or for the CPU; 1 selects threads, and 0 what suits the machine."""
     trust: tuple[str, ...] = ()
     """Modules of custom tasks and robots, such as my_lab.tasks, that the data may name."""
 
@@ -65,10 +66,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
         raise ConfigError(f"--batch is {flags.batch}, --processes {flags.processes}; expected 1 or more, and 0 or more.")
     keep_compiled_programs()
     take_memory_as_needed()
+    if flags.processes != 1 and not flags.from_states:
+        prepare_for_gpus()
     if flags.from_states:
         encode_experiment(experiment, rendered_pixels(), flags.batch)
     else:
-        encode_experiment(experiment, stored_pixels, flags.batch, flags.processes or default_processes())
+        encode_experiment(experiment, stored_pixels, flags.batch, flags.processes)
 
 
 def encode_experiment(experiment: Experiment, source: PixelSource = stored_pixels, batch: int = 4, processes: int = 1) -> None:
@@ -91,8 +94,8 @@ def encode_experiment(experiment: Experiment, source: PixelSource = stored_pixel
     with hold_lock(encoding.folder.with_name("-".join((encoding.folder.name, *encoded))), wait=True):
         measure = partial(report_ceiling, experiment, cache, dataset, episodes, source)
         with ThreadPoolExecutor(1) as thread:
-            # This process only waits while others encode, so it measures the ceiling meanwhile.
-            measured = thread.submit(measure) if processes > 1 else None
+            # Where processes read, and others encode on several GPUs, this one measures the ceiling meanwhile.
+            measured = thread.submit(measure) if jax.default_backend() != "cpu" and processes != 1 else None
             written = encode_episodes(cache, [*episodes, *replay_episodes(dataset, choice)], source, batch, processes)
             ceiling = measured.result() if measured else measure()
         header = {"version": CACHE_VERSION, "codec": codec.decoder_hash, "clip": asdict(experiment.clip)}

@@ -36,7 +36,7 @@ from xew.protocol import (
 )
 from xew.sim_warp.cameras import demand_sight, get_views
 from xew.sim_warp.changes.scenes import check_change, demand_change
-from xew.sim_warp.devices.workers import Workers, find_device, find_devices, quiet_warp, worker_count
+from xew.sim_warp.devices.workers import Workers, choose_physics, find_devices, quiet_warp, worker_count
 from xew.sim_warp.inspection.checks import render_views
 from xew.sim_warp.manifest import PACKAGED, Manifest, read_manifest
 from xew.sim_warp.production.cells import Job
@@ -80,9 +80,9 @@ class Args:
     """Number of processes; default: one per core, on GPUs one per two cores within their memory."""
     device: Annotated[str | None, tyro.conf.arg(metavar="cpu|cuda:0")] = None
     """Device; default: all GPUs of the first one's kind, shared by the workers, else the CPU."""
-    physics: Literal["cpu"] | None = None
-    """Run planning and physics on the CPU, rendering on the GPU. CPU physics is bit-repeatable, GPU physics is not: equal
-    machines make equal data sets (docs/performance.md). Takes about one core-second per episode."""
+    physics: Literal["cpu", "cuda"] | None = None
+    """Device for planning and physics; default: the CPU, or the GPU if there are less than 8 cores for each GPU. CPU physics is
+    bit-repeatable, GPU physics is not: equal processors make equal data sets (docs/performance.md)."""
     unpaired: bool = False
     """Use different seeds for each robot. Gives more scenes for codec training, but no paired comparison of robots."""
     motion: Literal["shared", "own"] = "shared"
@@ -110,8 +110,8 @@ class Args:
 def start_workers(args: Args, robots: Mapping[str, RobotSpec]) -> Iterator[Callable[[Sequence[Job]], Iterator[Timed]]]:
     """Start worker processes with compiled kernels; yields the function that makes the scenes of jobs."""
     devices = find_devices(args.device)
-    physics = find_device(args.physics) if args.physics else devices[0]
-    production = Production(args.folder, robots, physics.is_cuda, args.batch, not args.states_only)
+    physics = choose_physics(args.physics, devices)
+    production = Production(args.folder, robots, physics.is_cuda, args.batch, not args.states_only, len(devices))
     with Workers(args.workers or worker_count(devices, physics), devices) as workers:
         parts = {"physics": physics.alias, "kinematics": physics.alias, "rendering": devices[0].alias}
         compile_on_devices(workers, parts, args.batch)
@@ -135,11 +135,12 @@ def generate(args: Args) -> list[Family]:
         while jobs := {(family.task, job.seed): (family, job) for family in families for job in family.next_jobs()}:
             for records, seconds in make([job for _, job in jobs.values()]):
                 family, _ = jobs[records[0].task, records[0].seed]
+                before = family.accepted
                 for record in records:
                     family.add(record)
                 spent[family.task] += seconds
                 frames[family.task] += sum(record.frame_count for record in records if record.hashes)
-                bar.n = sum(f.accepted for f in families)
+                bar.n += family.accepted - before
                 bar.set_postfix_str(f"{records[0].task} {records[0].seed}", refresh=True)
     _print_speed(frames, spent)
     return families

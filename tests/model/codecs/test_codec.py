@@ -92,6 +92,15 @@ def test_padding_to_the_paper_s_size_is_lossless() -> None:
     np.testing.assert_array_equal(to_camera_size(padded), video)
 
 
+@pytest.mark.parametrize(
+    ("height", "width", "padding"), [(16, 20, (0, 1, 0, 0)), (15, 22, (0, 0, 1, 1)), (15, 20, (0,) * 4), (18, 20, (1, 2, 0, 0))]
+)
+def test_edges_are_repeated(height: int, width: int, padding: tuple[int, ...]) -> None:
+    video = np.random.default_rng(0).integers(0, 256, (2, 15, 20, 3), dtype=np.uint8)
+    widths = ((0, 0), padding[:2], padding[2:], (0, 0))
+    np.testing.assert_array_equal(to_model_size(video, height, width), np.pad(video, widths, mode="edge"))
+
+
 @pytest.mark.parametrize(("height", "width"), [(128, 160), (64, 80), (120, 160), (96, 160)])
 def test_resizing_keeps_the_geometry(height: int, width: int) -> None:
     """A bright square comes back where it was."""

@@ -1,6 +1,8 @@
 """Kernels that are compiled together: what is noted, what is launched, and that the smallest pieces leave nothing out."""
 
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -62,10 +64,9 @@ def test_what_is_compiled_together_is_loaded_and_then_launched() -> None:
 def test_the_smallest_pieces_launch_all_that_episodes_do(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
-    monkeypatch.setattr(warm_up, "has_kernels", lambda device: False)
-    device = wp.get_device("cpu")
+    monkeypatch.setattr(warm_up, "has_kernels", lambda device, module: False)
     with launched_modules(monkeypatch) as compiled:
-        warm_up.compile_kernels(InlineWorkers(2), device, batch=1)  # type: ignore[arg-type]
+        warm_up.compile_on_devices(InlineWorkers(2), dict.fromkeys(warm_up.PARTS, "cpu"), batch=1)  # type: ignore[arg-type]
     said = capsys.readouterr()
     assert wp.config.kernel_cache_dir in said.out
     assert "compiling kernels" in said.err and "0/3" in said.err and "3/3" in said.err
@@ -75,20 +76,43 @@ def test_the_smallest_pieces_launch_all_that_episodes_do(
     assert used <= compiled
 
 
-def test_parts_are_compiled_on_the_devices_that_they_run_on(monkeypatch: pytest.MonkeyPatch) -> None:
-    compiled: list[tuple[str, list[str]]] = []
-    monkeypatch.setattr(wp, "get_device", lambda name: name)
-    monkeypatch.setattr(warm_up, "compile_kernels", lambda pool, device, batch, parts: compiled.append((device, parts)))
+@pytest.mark.parametrize(
+    ("cached", "parts"),
+    [
+        ([], [("physics", "cpu"), ("kinematics", "cpu"), ("rendering", "cuda:0")]),
+        (["wp_xew.sim_warp.rendering.shading_kernels_1/a.sm90.cubin"], [("physics", "cpu"), ("kinematics", "cpu")]),
+        (
+            ["wp_newton._src.solvers.mujoco.kernels_1/a.sm90.cubin", "wp__lm_solve_tiled_7_20_1/a.cpu.o"],
+            [("physics", "cpu"), ("rendering", "cuda:0")],
+        ),
+    ],
+)
+def test_missing_parts_are_compiled_side_by_side_on_the_devices_that_they_run_on(
+    cached: list[str], parts: list[tuple[str, str]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
+    monkeypatch.setattr(wp, "get_device", lambda name: SimpleNamespace(is_cuda=name != "cpu"))
+    for name in cached:
+        (tmp_path / name).parent.mkdir()
+        (tmp_path / name).touch()
+    started: list[tuple[str, str]] = []
+    pool = SimpleNamespace(run=lambda function, items: started.extend(items) or items)
     devices = {"physics": "cpu", "kinematics": "cpu", "rendering": "cuda:0"}
-    warm_up.compile_on_devices(InlineWorkers(1), devices, 1)  # type: ignore[arg-type]
-    assert compiled == [("cpu", ["physics", "kinematics"]), ("cuda:0", ["rendering"])]
+    warm_up.compile_on_devices(cast(Any, pool), devices, 1)
+    assert started == parts
 
 
-def test_what_is_compiled_is_not_compiled_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(warm_up, "has_kernels", lambda device: True)
-    with launched_modules(monkeypatch) as compiled:
-        warm_up.compile_kernels(InlineWorkers(2), wp.get_device("cpu"), batch=1)  # type: ignore[arg-type]
-    assert not compiled
+def test_inverse_kinematics_are_compiled_for_the_device_of_the_part(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A worker's default device is another one where physics runs on the CPU and rendering on a GPU."""
+    asked: list[str] = []
+
+    def note_device(robot: object, device: str) -> Any:
+        asked.append(device)
+        return SimpleNamespace(solve=lambda *arguments: None)
+
+    monkeypatch.setattr(warm_up, "arm_solver", note_device)
+    warm_up.do_smallest_piece("kinematics", "cpu", 1)
+    assert asked == ["cpu"]
 
 
 @pytest.mark.skipif(90 not in wp.get_cuda_supported_archs(), reason="this build of Warp has no compiler for CUDA")

@@ -233,6 +233,22 @@ def test_paths_are_followed_smoothly(robot: RobotSpec) -> None:
     assert np.abs(np.diff(solution.joint_pos, axis=0)).max() < 0.25
 
 
+@pytest.mark.parametrize("lengths", [(1, 9), (10, 8), (17, 4)])
+def test_a_path_has_the_same_bits_with_longer_and_shorter_ones(lengths: tuple[int, int]) -> None:
+    robot = ROBOTS["ur5_wsg"]
+    start = np.array([robot.arms[0].home, robot.arms[1].home])
+    turned = start + np.linspace(0, 0.3, max(lengths))[:, None, None]
+    poses = np.stack([tool_pose(robot, arm, turned[:, arm]) for arm in (0, 1)], 1)
+    solver = ArmSolver(robot)
+    together = solver.solve_path([0, 1], poses, start, np.array(lengths))
+    for arm, length in enumerate(lengths):
+        alone = solver.solve_path(arm, poses[:length, arm : arm + 1], start[arm : arm + 1])
+        assert np.array_equal(together.joint_pos[:length, arm], alone.joint_pos[:, 0])
+        assert np.array_equal(
+            together.joint_pos[length - 1 :, arm], alone.joint_pos[-1:].repeat(max(lengths) - length + 1, 0)[:, 0]
+        )
+
+
 def test_a_batch_of_one_is_a_row_of_a_larger_batch() -> None:
     robot = ROBOTS["franka_panda"]
     rng = np.random.default_rng(4)

@@ -3,6 +3,7 @@
 import pickle
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
@@ -18,13 +19,15 @@ ROBOTS = ("franka_panda", SLOW)
 PRODUCTION = Production(Path("nowhere"), WITH_SLOW)
 
 
-def make(jobs: list[Job], monkeypatch: pytest.MonkeyPatch) -> tuple[list[tuple[list[Record], float]], list[tuple[Any, ...]]]:
+def make(
+    jobs: list[Job], monkeypatch: pytest.MonkeyPatch, production: Production = PRODUCTION
+) -> tuple[list[tuple[list[Record], float]], list[tuple[Any, ...]]]:
     """What comes of some jobs, and the units of work in the order in which they were done; each takes a second."""
     done: list[tuple[Any, ...]] = []
 
     def simulate(share: list[Job], production: Production) -> tuple[list[list[Cell]], float]:
         done.extend(("simulate", job.seed, job.robots) for job in share)
-        return simulate_jobs(share, production), 1.0
+        return simulate_jobs(share, replace(production, gpu_physics=False)), 1.0
 
     def write(cells: list[Cell], rejected: bool, production: Production) -> tuple[list[Record], float]:
         rejected = rejected or any(cell.failure for cell in cells)
@@ -33,7 +36,7 @@ def make(jobs: list[Job], monkeypatch: pytest.MonkeyPatch) -> tuple[list[tuple[l
 
     monkeypatch.setattr(produce, "_simulate", simulate)
     monkeypatch.setattr(produce, "_write", write)
-    return list(make_scenes(cast(Any, InlineWorkers(1)), jobs, PRODUCTION)), done
+    return list(make_scenes(cast(Any, InlineWorkers(1)), jobs, production)), done
 
 
 def test_a_scene_is_written_as_soon_as_all_robots_are_simulated(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -58,8 +61,40 @@ def test_a_gpu_gets_as_many_whole_scenes_as_it_steps_worlds() -> None:
     jobs = [Job(TASK, seed, ROBOTS) for seed in range(5)]
     batches = replace(PRODUCTION, gpu_physics=True, batch=8).shares(jobs)
     assert [[job.seed for job in share] for share in batches] == [[0, 1, 2, 3], [4]]
-    assert [job.robots for share in PRODUCTION.shares(jobs[:1]) for job in share] == [(robot,) for robot in ROBOTS]
     assert (replace(PRODUCTION, gpu_physics=True).physics, PRODUCTION.physics) == (None, "cpu")
+
+
+@pytest.mark.parametrize(
+    ("scenes", "workers", "sizes"),
+    [(1, 1, [1, 1]), (5, 1, [2, 2, 2, 2, 1, 1]), (5, 8, [1] * 10), (40, 1, [16, 16, 16, 16, 8, 8]), (40, 2, [10] * 8)],
+)
+def test_a_core_gets_one_robot_of_a_few_scenes(scenes: int, workers: int, sizes: list[int]) -> None:
+    """There are at least four shares for each worker, so all end at about the same time."""
+    jobs = [Job(TASK, seed, ROBOTS) for seed in range(scenes)]
+    shares = PRODUCTION.shares(jobs, workers)
+    assert [len(share) for share in shares] == sizes
+    assert all(len({job.robots for job in share}) == 1 for share in shares)
+    assert sorted((job.seed, *job.robots) for share in shares for job in share) == sorted(
+        (job.seed, robot) for job in jobs for robot in ROBOTS
+    )
+
+
+def test_few_batches_are_in_flight_on_a_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Scenes of a batch are written while the next ones are stepped, before the last batch begins."""
+    jobs = [Job(TASK, 0, (robot,)) for robot in ROBOTS[:1]] + [Job(TASK, seed, ROBOTS[:1]) for seed in (2, 4, 6)]
+    _, done = make(jobs, monkeypatch, replace(PRODUCTION, gpu_physics=True, batch=1))
+    assert [step[:2] for step in done] == [(kind, seed) for seed in (0, 2, 4, 6) for kind in ("simulate", "write")]
+    monkeypatch.setattr(produce, "BATCHES_PER_GPU", 2)
+    handed: list[int] = []
+
+    def run(function: Any, work: Any) -> Any:
+        while work:
+            handed.append(len(work))
+            yield function(work.popleft())
+
+    pool = cast(Any, SimpleNamespace(count=4, run=run))
+    list(make_scenes(pool, jobs, replace(PRODUCTION, gpu_physics=True, batch=1)))
+    assert max(handed) == 3, "two batches and a scene to write"
 
 
 def test_a_cell_travels_without_its_task(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 import cv2
 import jax
 import numpy as np
+from tqdm import tqdm
 
 from xew.compilation import keep_compiled_programs, take_memory_as_needed
 from xew.concurrency import free_gpu_memory, map_in_order, map_in_processes, usable_cores, visible_gpus
@@ -21,7 +22,9 @@ from xew.metrics.backends import MASKERS, TRACKERS, Masker, Tracker, open_masker
 from xew.metrics.grade import input_kind
 from xew.metrics.grading.codecs import ModelCodec, open_codecs
 from xew.metrics.grading.grade_episodes import Grader, Group, GroupResult, ThreadResources
+from xew.metrics.grading.list_jobs import Job
 from xew.metrics.grading.settings import GradingSettings
+from xew.metrics.grading.warm_up import Part, missing_parts, note_compiled
 
 PROCESSES = "XEW_EVALUATE_PROCESSES"
 """Environment variable by which tests set the number of processes."""
@@ -55,13 +58,33 @@ def grade_groups(settings: GradingSettings, codecs: Mapping[str, ModelCodec], gr
 
     They are at most a few groups ahead of each other, so memory does not grow with the number of groups.
     """
-    processes = choose_processes(len(groups), sum(map(len, groups)))
+    processes, gpus = choose_processes(len(groups), sum(map(len, groups))), visible_gpus()
+    if gpus and groups:
+        warm_up(settings, [job for group in groups for job, _ in group], gpus)
     if processes > 1:
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # processes share the cores
-        return map_in_processes(functools.partial(_open_in_process, settings), groups, processes, IMPORTED, visible_gpus())
-    threads = 1 if jax.default_backend() != "cpu" or visible_gpus() else min(usable_cores(), MOST_THREADS)
+        return map_in_processes(functools.partial(_open_in_process, settings), groups, processes, IMPORTED, gpus)
+    threads = 1 if jax.default_backend() != "cpu" or gpus else min(usable_cores(), MOST_THREADS)
     stop = threading.Event()
     return map_in_order(open_grader(settings, codecs, stop), groups, threads, stop)
+
+
+def warm_up(settings: GradingSettings, jobs: Sequence[Job], gpus: Sequence[str]) -> None:
+    """Compile what the machine's caches lack to grade these jobs, before any process grades."""
+    parts = missing_parts(settings, jobs)
+    if not parts:
+        return
+    print(f"compiles {len(parts)} parts of the GPU's kernels and programs, once for this machine; then grades", flush=True)
+    opener = functools.partial(_open_compiler, settings.args.trust)
+    compiled = map_in_processes(opener, parts, min(len(parts), usable_cores()), IMPORTED, gpus)
+    for _ in tqdm(compiled, desc="compile", unit="part", total=len(parts), disable=None, leave=False):
+        pass
+    note_compiled(settings, jobs)
+
+
+def _open_compiler(trust: Sequence[str]) -> Callable[[Part], None]:
+    prepare_process(trust)
+    return lambda part: part.compile()
 
 
 def choose_processes(episodes: int, videos: int) -> int:

@@ -10,15 +10,18 @@ import of this package. The tables are a function of what was graded alone: the 
 many threads, and how often it was stopped on the way.
 """
 
+import base64
 import hashlib
+import itertools
 import json
 import math
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
@@ -33,6 +36,8 @@ from xew.files import read_json, replacing, write_bytes
 from xew.metrics import METRICS
 from xew.metrics.grade import Grades
 from xew.protocol import BASELINES
+
+Item = TypeVar("Item")
 
 KEY = ["model", "condition", "task", "seed", "robot"]
 ROW_GROUP = 64
@@ -92,7 +97,7 @@ class CellStore:
             if stored["content"] != cell.content:
                 return None
             values = {name: math.nan if value is None else float(value) for name, value in stored["values"].items()}
-            curves = {name: np.array(curve, np.float32) for name, curve in stored["curves"].items()}  # null becomes NaN
+            curves = {name: _decode(curve) for name, curve in stored["curves"].items()}
             exact_frames = int(stored["exact_frames"])
             whole = all(curve.ndim == 1 and len(curve) <= cell.frames for curve in curves.values())
             return Grades(values, curves, exact_frames) if whole and 0 <= exact_frames <= cell.frames else None
@@ -113,7 +118,7 @@ class CellStore:
             "content": cell.content,
             "exact_frames": grades.exact_frames,
             "values": {name: _finite_or_none(value) for name, value in values.items()},
-            "curves": {name: [_finite_or_none(value) for value in curve.tolist()] for name, curve in curves.items()},
+            "curves": {name: _encode(curve) for name, curve in curves.items()},
         }
         root = self.baselines if cell.model in BASELINES else self.folder
         write_bytes(self._path(cell), json.dumps(content).encode(), within=root.parent)
@@ -155,67 +160,66 @@ def path_beside(path: Path, ending: str) -> Path:
     return path.with_suffix(f".{ending}")
 
 
+Graded = Sequence[tuple[Cell, Grades]]
+"""Cells and their scores."""
+
+
 def write_tables(path: Path, attributes: dict[str, Any], cells: Sequence[Cell], store: CellStore) -> None:
     """Write both tables of the cells that are graded, sorted, so the order of work leaves no trace."""
     metrics = list(attributes["metrics"])
-    # The curves first: what is in the table always has its curves.
-    _write_table(path_beside(path, "curves.parquet"), CURVES, _curve_table, attributes, metrics, cells, store)
-    _write_table(path, ROWS, _row_table, attributes, metrics, cells, store)
-
-
-def _write_table(
-    path: Path,
-    schema: pa.Schema,
-    tabulate: Callable[[Cell, Grades, Sequence[str]], pa.Table],
-    attributes: dict[str, Any],
-    names: Sequence[str],
-    cells: Sequence[Cell],
-    store: CellStore,
-) -> None:
     graded = ((cell, store.read(cell)) for cell in sorted(cells, key=lambda cell: cell.key))
-    tables = (tabulate(cell, grades, names) for cell, grades in graded if grades and grades.values.keys() >= set(names))
-    _write_parquet(path, schema.with_metadata({"PANDAS_ATTRS": json.dumps(attributes)}), tables)
+    complete = ((cell, grades) for cell, grades in graded if grades and grades.values.keys() >= set(metrics))
+    # The curves are renamed first: what is in the table always has its curves.
+    with (
+        _open_table(path, ROWS, attributes) as rows,
+        _open_table(path_beside(path, "curves.parquet"), CURVES, attributes) as curves,
+    ):
+        for group in _groups(complete, ROW_GROUP):
+            rows.write_table(_row_table(group, metrics).replace_schema_metadata(rows.schema.metadata))
+            curves.write_table(_curve_table(group, metrics).replace_schema_metadata(curves.schema.metadata))
 
 
-def _row_table(cell: Cell, grades: Grades, metrics: Sequence[str]) -> pa.Table:
-    names = [name for name in metrics if math.isfinite(grades.values[name])]
-    count = len(names)
-    columns = [*_repeat_key(cell, count), pa.array(names, pa.string()), pa.array([grades.values[name] for name in names])]
-    columns += [pa.repeat(pa.scalar(number, pa.int64()), count) for number in (cell.frames, grades.exact_frames)]
-    return pa.table([*columns, pa.repeat(cell.content, count)], names=ROWS.names).cast(ROWS)
-
-
-def _curve_table(cell: Cell, grades: Grades, metrics: Sequence[str]) -> pa.Table:
-    names = [name for name in metrics if name in grades.curves and math.isfinite(grades.values[name])]
-    if not names:
-        return CURVES.empty_table()
-    curves = [grades.curves[name] for name in names]
-    known = [np.flatnonzero(np.isfinite(curve)) for curve in curves]
-    frames = np.concatenate([cell.frames - len(curve) + some for curve, some in zip(curves, known, strict=True)])
-    values = np.concatenate([curve[some] for curve, some in zip(curves, known, strict=True)])
-    of = pa.array(names, pa.string()).take(pa.array(np.repeat(np.arange(len(names)), list(map(len, known)))))
-    columns = [*_repeat_key(cell, len(values)), of, pa.array(frames), pa.array(values)]
-    return pa.table(columns, names=CURVES.names).cast(CURVES)
-
-
-def _repeat_key(cell: Cell, count: int) -> list[pa.Array]:
-    return [pa.repeat(pa.scalar(getattr(cell, name), kind), count) for name, kind in _KEY_FIELDS[: len(KEY)]]
-
-
-def _write_parquet(path: Path, schema: pa.Schema, tables: Iterator[pa.Table]) -> None:
+@contextmanager
+def _open_table(path: Path, schema: pa.Schema, attributes: dict[str, Any]) -> Iterator[pq.ParquetWriter]:
+    schema = schema.with_metadata({"PANDAS_ATTRS": json.dumps(attributes)})
     with replacing(path, within=path.parent) as temporary, pq.ParquetWriter(temporary, schema) as writer:
-        for group in _groups(tables, ROW_GROUP):
-            writer.write_table(pa.concat_tables(group).replace_schema_metadata(schema.metadata))
+        yield writer
 
 
-def _groups(items: Iterator[pa.Table], size: int) -> Iterator[list[pa.Table]]:
-    group: list[pa.Table] = []
-    for item in items:
-        group.append(item)
-        if len(group) == size:
-            yield group
-            group = []
-    if group:
+def _row_table(graded: Graded, metrics: Sequence[str]) -> pa.Table:
+    values = np.array([[grades.values[name] for name in metrics] for _, grades in graded])
+    cell_index, metric_index = np.nonzero(np.isfinite(values))
+    frames = [[cell.frames for cell, _ in graded], [grades.exact_frames for _, grades in graded]]
+    columns = [*_repeat_keys(graded, cell_index), pa.array(metrics, pa.string()).take(pa.array(metric_index))]
+    columns += [pa.array(values[cell_index, metric_index]), *(pa.array(np.array(some)[cell_index]) for some in frames)]
+    content = pa.array([cell.content for cell, _ in graded]).take(pa.array(cell_index))
+    return pa.table([*columns, content], names=ROWS.names).cast(ROWS)
+
+
+def _curve_table(graded: Graded, metrics: Sequence[str]) -> pa.Table:
+    curves = [np.empty(0, np.float32)]
+    places = [(0, 0, 0)]  # cell, metric and first frame of each curve
+    for i, (cell, grades) in enumerate(graded):
+        for j, name in enumerate(metrics):
+            if name in grades.curves and math.isfinite(grades.values[name]):
+                curves.append(grades.curves[name])
+                places.append((i, j, cell.frames - len(curves[-1])))
+    lengths = list(map(len, curves))
+    values, frame = np.concatenate(curves), np.concatenate([*map(np.arange, lengths)])
+    known = np.isfinite(values)
+    cell_index, metric_index, first = np.repeat(places, lengths, axis=0)[known].T
+    columns = [*_repeat_keys(graded, cell_index), pa.array(metrics, pa.string()).take(pa.array(metric_index))]
+    return pa.table([*columns, pa.array(first + frame[known]), pa.array(values[known])], names=CURVES.names).cast(CURVES)
+
+
+def _repeat_keys(graded: Graded, cell_index: np.ndarray) -> list[pa.Array]:
+    """Columns of the keys of rows, by the index [r] of each row's cell."""
+    index = pa.array(cell_index)
+    return [pa.array([getattr(cell, name) for cell, _ in graded], kind).take(index) for name, kind in _KEY_FIELDS[: len(KEY)]]
+
+
+def _groups(items: Iterator[Item], size: int) -> Iterator[list[Item]]:
+    while group := list(itertools.islice(items, size)):
         yield group
 
 
@@ -234,3 +238,15 @@ def describe(settings: dict[str, Any], metrics: tuple[str, ...]) -> dict[str, An
 
 def _finite_or_none(value: float) -> float | None:
     return value if math.isfinite(value) else None
+
+
+def _encode(curve: np.ndarray) -> str:
+    """A curve [t] float32 as text, of which 12,500 videos are read in seconds. What is not finite becomes NaN."""
+    return base64.b64encode(np.where(np.isfinite(curve), curve, np.nan).astype("<f4").tobytes()).decode()
+
+
+def _decode(curve: str | list[float | None]) -> np.ndarray:
+    """The curve [t] float32 of `_encode`, or of a list as earlier versions wrote it."""
+    if isinstance(curve, str):
+        return np.frombuffer(base64.b64decode(curve, validate=True), "<f4")
+    return np.array(curve, np.float32)  # null becomes NaN

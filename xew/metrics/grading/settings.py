@@ -1,6 +1,6 @@
 """The options of `evaluate`, and what they are resolved to before anything is read."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -10,11 +10,11 @@ import tyro
 
 from xew.config import ConfigError, pick, suggestion
 from xew.dataset import view_folder
-from xew.metrics import METRICS
+from xew.metrics import METRICS, perceptual
 from xew.metrics.backends import MASKERS, TRACKERS, identity
 from xew.metrics.grading.scores import CellStore, baselines_folder, path_beside, surfaces_folder
-from xew.metrics.grading.weights import check_weights
 from xew.metrics.metric import SUITES
+from xew.metrics.networks import alexnet
 from xew.protocol import GRADING_PROTOCOL, HEAD
 
 
@@ -140,3 +140,12 @@ def _identify(registry: Any, kind: str, name: str, checkpoint: Path | None) -> s
     if checkpoint is not None and not checkpoint.exists():
         raise ConfigError(f"the checkpoint of the {kind} is {checkpoint}, which does not exist; name another, or leave it out.")
     return identity(name, checkpoint)
+
+
+def check_weights(metrics: Iterable[str] = tuple(METRICS)) -> None:
+    """Raise ConfigError unless what these metrics (keys of METRICS) need is installed; the message says what would bring it."""
+    if any(METRICS[name].function.__module__ == perceptual.__name__ for name in metrics):
+        try:
+            alexnet.read_alexnet()
+        except FileNotFoundError as error:
+            raise ConfigError(str(error)) from error

@@ -35,7 +35,7 @@ class Ceiling:
 
 def check_lpips() -> None:
     """Raise ConfigError unless the weights of LPIPS are installed."""
-    from xew.metrics.grading.weights import check_weights
+    from xew.metrics.grading.settings import check_weights
 
     check_weights(("lpips",))
 

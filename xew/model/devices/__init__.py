@@ -1,3 +1,3 @@
-"""Many devices and hosts: the mesh, sharding of parameters and batches, and starting the processes."""
+"""Many devices and hosts: the mesh, sharding of parameters and batches, and processes that share the GPUs."""
 
-__all__ = ["sharding"]
+__all__ = ["parts", "sharding"]

@@ -1,21 +1,15 @@
-"""Reading what a rollout is given of its episodes: first frame, conditions, and the pictures of decoders that use them.
+"""Reading what a rollout is given of its episodes: first frame, conditions, and the pictures of decoders that use them."""
 
-Threads suffice for a network on a CPU. A GPU would wait for them, because they wait for Python's lock and render one at a time;
-processes read for it.
-"""
-
-import functools
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
-from xew.concurrency import map_in_order, map_with_shared_memory
 from xew.dataset import Episode
 from xew.episode import Record, read_pixels
 from xew.model.cache.clips import needed_pixels, read_streams
 from xew.model.conditions import Condition, shows_carried
+from xew.model.devices.parts import RENDERERS, read_ahead
 from xew.model.episodes.commands import episode_command
 from xew.model.settings.settings import Clip
 from xew.model.video.frames import to_model_size
@@ -28,7 +22,7 @@ Streams = dict[str, np.ndarray]
 """Inputs of one whole episode by stream: uint8 [t h w 3] or float32 [t n]; with FIRST and, for some decoders, RENDER, SCENE."""
 EpisodeInputs = tuple[Record, Streams]
 """An episode that was read."""
-IMPORTED = (__name__, "xew.sim_warp.rendering.streams")
+IMPORTED = (__name__, *RENDERERS)
 """Modules that processes that read need."""
 
 
@@ -58,14 +52,4 @@ class EpisodeReader:
         self, episodes: Sequence[Episode], threads: int | None = None, processes: int = 0
     ) -> Iterator[EpisodeInputs]:
         """Inputs of episodes in their order, read ahead in threads, by default one a core, or in processes if there are any."""
-        if not processes:
-            return map_in_order(self.read, episodes, threads)
-        return map_with_shared_memory(functools.partial(_open_reader, self), episodes, processes, IMPORTED)
-
-
-def _open_reader(reader: EpisodeReader) -> Callable[[Episode], EpisodeInputs]:
-    from xew.sim_warp.devices.workers import quiet_warp
-
-    quiet_warp()
-    cv2.setNumThreads(1)  # processes share the cores
-    return reader.read
+        return read_ahead(self.read, episodes, threads, processes, (__name__,))

@@ -2,10 +2,7 @@
 
 import functools
 import itertools
-import multiprocessing
-import os
 import sys
-import threading
 from collections import deque
 from collections.abc import Callable, Sequence
 from multiprocessing.queues import SimpleQueue
@@ -16,8 +13,9 @@ from typing import Any
 import jax
 from tqdm import tqdm
 
-from xew.concurrency import free_gpu_memory, map_in_order, map_in_processes, prepare_processes, usable_cores, visible_gpus
+from xew.concurrency import prepare_processes, usable_cores, visible_gpus
 from xew.dataset import Episode
+from xew.model.devices.parts import choose_readers, run_on_gpus
 from xew.model.sampling import reading
 from xew.model.sampling.predict import Prediction, Predictor
 from xew.model.sampling.writing import RolloutWriter
@@ -26,10 +24,6 @@ Item = tuple[Episode, dict[str, Any]]
 """An episode to predict and the header of its rollout."""
 MOST_READERS = 8
 """Largest number of processes that read for a GPU."""
-GPU_MEMORY_OF_READER = 2.5
-"""GPU memory of a process that reads [GB]: 512 frames in flight and CUDA's own memory."""
-EPISODES_OF_READER = 4
-"""Number of episodes for which a process that reads is worth its start of a few seconds."""
 
 
 def roll_out(open_predictor: Callable[[], Predictor], pending: Sequence[Item], out: Path) -> None:
@@ -40,7 +34,7 @@ def roll_out(open_predictor: Callable[[], Predictor], pending: Sequence[Item], o
         with progress() as bar:
             roll_out_on_gpus(functools.partial(_open_part, open_predictor, out), pending, gpus, bar.update)
         return
-    if readers := choose_readers(len(pending)):
+    if readers := choose_readers(len(pending), _most_readers()):
         prepare_processes(reading.IMPORTED)
     predictor = open_predictor()
     with progress() as bar:
@@ -54,41 +48,17 @@ Part = Callable[[Sequence[Item]], object]
 def roll_out_on_gpus(
     opener: Callable[[SimpleQueue, Event], Part], pending: Sequence[Item], gpus: Sequence[str], done: Callable[[], object]
 ) -> None:
-    """Share episodes among processes, one a GPU. After an error the other processes end with their batch.
-
-    Args:
-        opener: called in each process with a queue, which gets an item for every written rollout, and an event that is set
-            for the process to end early; returns the function that rolls out its part.
-        pending: episodes; each process gets as many of every length.
-        gpus: GPUs as CUDA_VISIBLE_DEVICES names them.
-        done: called for every written rollout, in another thread.
-    """
-    ordered, context = sorted(pending, key=_frames), multiprocessing.get_context("forkserver")
-    written, stop = context.SimpleQueue(), context.Event()
-
-    def run(number: int) -> None:
-        opener_of_part, imported = functools.partial(opener, written, stop), (__name__, *reading.IMPORTED)
-        try:
-            list(map_in_processes(opener_of_part, [ordered[number :: len(gpus)]], 1, imported, gpus[number : number + 1]))
-        except BaseException:
-            stop.set()
-            raise
-
-    follower = threading.Thread(target=lambda: [done() for _ in iter(written.get, None)])
-    follower.start()
-    try:
-        list(map_in_order(run, range(min(len(gpus), len(ordered))), len(gpus), stop))
-    finally:
-        written.put(None)
-        follower.join()
+    """`run_on_gpus` of episodes, of which each process gets as many of every length; `done` is called for every rollout."""
+    run_on_gpus(opener, sorted(pending, key=_frames), gpus, lambda _: done(), (__name__, *reading.IMPORTED))
 
 
 def _open_part(open_predictor: Callable[[], Predictor], out: Path, written: SimpleQueue, stop: Event) -> Part:
+    prepare_processes(reading.IMPORTED)
     predictor = open_predictor()
 
     def roll_out_part(pending: Sequence[Item]) -> None:
         writer = RolloutWriter(out, lambda: written.put(1))
-        predict_and_write(predictor, pending, writer, choose_readers(len(pending)), stop.is_set)
+        predict_and_write(predictor, pending, writer, choose_readers(len(pending), _most_readers()), stop.is_set)
 
     return roll_out_part
 
@@ -132,13 +102,8 @@ def predict_and_write(
             write_oldest()
 
 
-def choose_readers(episodes: int) -> int:
-    """Number of processes that read for the GPU of this process; 0 for threads, as on a CPU and for few episodes."""
-    if jax.default_backend() != "gpu" or not hasattr(os, "memfd_create"):
-        return 0
-    memory = min(free_gpu_memory(visible_gpus()), default=0.0)
-    most = min(MOST_READERS, usable_cores() // 2, int(memory / GPU_MEMORY_OF_READER))
-    return most if most > 1 and episodes >= most * EPISODES_OF_READER else 0
+def _most_readers() -> int:
+    return min(MOST_READERS, usable_cores() // 2)
 
 
 def _frames(item: Item) -> int:

@@ -21,10 +21,10 @@ DEFAULT_BLOCK = 256
 """Default number of threads per block of a launch."""
 
 
-def has_kernels(device: wp.Device) -> bool:
-    """Whether Warp has compiled any kernel for this kind of device on this machine."""
+def has_kernels(device: wp.Device, module: str = "") -> bool:
+    """Whether Warp has compiled a module, named by its beginning, or any for this kind of device on this machine."""
     ending = "cubin" if device.is_cuda else "o"
-    return any(Path(wp.config.kernel_cache_dir).glob(f"wp_*/*.{ending}"))
+    return any(Path(wp.config.kernel_cache_dir).glob(f"wp_{module}*/*.{ending}"))
 
 
 @contextmanager

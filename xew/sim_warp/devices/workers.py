@@ -28,6 +28,9 @@ FRAMES_OF_A_RENDERING_WORKER = 192
 """Number of frames in flight of a worker that steps physics on the CPU and renders on the GPU."""
 MEMORY_PER_RENDERING_WORKER = 3e9
 """GPU memory of such a worker [bytes]; 14 workers on an H100 took 1.8e9 each."""
+CORES_PER_GPU = 8
+"""Number of cores for each GPU from which physics runs on the CPU. A core plans and steps 5 worlds a second. An H100 steps 43 a
+second in batches of 256, must render at the same time, and compiles kernels of planning and physics for minutes."""
 
 
 def find_device(name: str | None) -> warp.Device:
@@ -46,6 +49,23 @@ def find_devices(name: str | None) -> list[warp.Device]:
     """
     gpus = warp.get_cuda_devices() if name is None else []
     return [gpu for gpu in gpus if gpu.name == gpus[0].name] or [find_device(name)]
+
+
+def choose_physics(name: str | None, devices: Sequence[warp.Device]) -> warp.Device:
+    """The device for planning and physics: cpu, cuda, or by default the CPU if it has enough cores for each GPU.
+
+    Args:
+        name: value of --physics.
+        devices: devices for rendering.
+
+    Raises:
+        ConfigError: physics is to run on a GPU, and there is none.
+    """
+    on_gpu = devices[0].is_cuda
+    if name == "cuda" and not on_gpu:
+        raise ConfigError(f"--physics cuda needs a GPU, and the device is {devices[0].alias}; omit it.")
+    few_cores = usable_cores() < CORES_PER_GPU * len(devices)
+    return devices[0] if on_gpu and (name == "cuda" or (name is None and few_cores)) else find_device("cpu")
 
 
 def worker_count(devices: Sequence[warp.Device], physics: warp.Device | None = None) -> int:
@@ -73,7 +93,7 @@ class Workers:
 
     def __init__(self, count: int, devices: Sequence[warp.Device] = ()) -> None:
         os.environ.setdefault("OMP_NUM_THREADS", "1")  # one core per worker
-        self._count = count
+        self.count = count
         self._pool = open_processes(count, IMPORTED, _begin_worker, own=[device.alias for device in devices])
 
     def __enter__(self) -> "Workers":
@@ -96,7 +116,7 @@ class Workers:
         under_way: set[Future[Result]] = set()
         try:
             while waiting or under_way:
-                while waiting and len(under_way) < 2 * self._count:  # one waiting job per worker
+                while waiting and len(under_way) < 2 * self.count:  # one waiting job per worker
                     under_way.add(self._pool.submit(function, waiting.popleft()))
                 done, under_way = wait(under_way, return_when=FIRST_COMPLETED)
                 for future in done:
@@ -109,6 +129,13 @@ def _begin_worker(device: str | None = None) -> None:
     quiet_warp()
     if device is not None:
         warp.set_device(device)
+        keep_memory(warp.get_device())
+
+
+def keep_memory(device: warp.Device) -> None:
+    """Let a GPU's pool keep freed memory for the next chunk of frames. By default it is returned and mapped again."""
+    if device.is_cuda and device.is_mempool_supported:
+        warp.set_mempool_release_threshold(device, 1.0)
 
 
 def quiet_warp() -> None:

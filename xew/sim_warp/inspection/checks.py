@@ -16,7 +16,7 @@ from xew.sim_warp.cameras import demand_sight
 from xew.sim_warp.changes.scenes import check_change
 from xew.sim_warp.devices.workers import Workers, find_devices, worker_count
 from xew.sim_warp.production.rerender import add_tiled, add_videos, add_view, demand_plausible, render_again, render_changed
-from xew.sim_warp.production.warm_up import compile_kernels
+from xew.sim_warp.production.warm_up import compile_on_devices
 from xew.sim_warp.rendering.render import Renderer
 from xew.sim_warp.robots import recorded_robot
 from xew.sim_warp.robots.user.own import KEPT, keep_robot, kept_robot
@@ -87,7 +87,7 @@ def _render_all(render: Callable[[Path], Result], folders: list[Path]) -> list[R
     several = len(folders) >= 2 * EPISODES_PER_WORKER
     with Workers(worker_count(devices), devices) as workers:
         if several:
-            compile_kernels(workers, devices[0], 1, ("rendering",))
+            compile_on_devices(workers, {"rendering": devices[0].alias}, 1)
         results = workers.run(render, folders) if several else map(render, folders)
         return list(tqdm(results, desc="rendering", unit="episode", total=len(folders)))
 

@@ -26,11 +26,15 @@ class Commands:
 
 
 def joint_commands(robot: RobotSpec, paths: list[ToolPath], device: str | None = None) -> list[Commands]:
-    """Joint commands [t 16] of a robot for many tool paths, solved together on a device; each frame near the previous one."""
+    """Joint commands [t 16] of a robot for many tool paths, solved together on a device; each frame near the previous one.
+
+    The bits of a path's commands do not depend on the other paths.
+    """
     longest = max(path.frame_count for path in paths)
     targets = np.stack([_extend_path(path.pose, longest) for path in paths], 1).reshape(longest, -1, 7)
     arms = np.tile([LEFT, RIGHT], len(paths))
-    solution = arm_solver(robot, device).solve_path(arms, targets, np.array([robot.arms[arm].home for arm in arms]))
+    lengths = np.repeat([path.frame_count for path in paths], 2)
+    solution = arm_solver(robot, device).solve_path(arms, targets, np.array([robot.arms[arm].home for arm in arms]), lengths)
     commands = []
     for index, path in enumerate(paths):
         columns, frames = slice(2 * index, 2 * index + 2), slice(path.frame_count)

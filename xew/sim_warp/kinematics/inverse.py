@@ -89,21 +89,34 @@ class ArmSolver:
         reached = np.linalg.inv(self.base)[side] @ self._reached(side, joint_pos)
         return Solution(joint_pos, *_pose_errors(reached, tool_pose))
 
-    def solve_path(self, arm: int | np.ndarray, tool_pose: np.ndarray, start: np.ndarray) -> Solution:
-        """Solution [t n ...] along paths of the tool [t n 7], from joint positions `start` [n d] rad, for arms [n]."""
+    def solve_path(
+        self, arm: int | np.ndarray, tool_pose: np.ndarray, start: np.ndarray, lengths: np.ndarray | None = None
+    ) -> Solution:
+        """Solution [t n ...] along paths of the tool; the bits of a path do not depend on the others.
+
+        Args:
+            arm: 0 (left) or 1 (right), one for all or [n].
+            tool_pose: [t n 7], target poses of the tool frame in the world.
+            start: [n d], joint positions before the first pose [rad].
+            lengths: [n] int, numbers of frames of the paths, after which their last pose is repeated; default: t.
+        """
         frames, count = tool_pose.shape[:2]
-        arms = np.tile(np.broadcast_to(arm, count), frames)
-        poses = tool_pose.reshape(-1, 7)
-        targets = self._in_base(arms, poses)
-        anchors = np.unique(np.append(np.arange(0, frames, ANCHOR_STRIDE), frames - 1))
-        at_anchor = np.empty((len(anchors), *start.shape))
+        arm, columns = np.broadcast_to(arm, count), np.arange(count)
+        last = np.full(count, frames - 1) if lengths is None else lengths - 1
+        anchors = np.minimum(np.arange(0, frames + ANCHOR_STRIDE - 1, ANCHOR_STRIDE)[:, None], last)
+        at_anchor = np.repeat(start[None], len(anchors), 0)
         for index, frame in enumerate(anchors):
-            rows = slice(frame * count, (frame + 1) * count)
-            start = at_anchor[index] = self._nearest(arms[rows], targets[rows], start)
-        seed = _interpolate(np.arange(frames), anchors, at_anchor)
-        joint_pos = self._nearest(arms, targets, seed.reshape(frames * count, -1))
-        position, rotation = _pose_errors(self._reached(arms, joint_pos), poses)
-        return Solution(joint_pos.reshape(seed.shape), position.reshape(frames, count), rotation.reshape(frames, count))
+            still = np.flatnonzero(index * ANCHOR_STRIDE < last + ANCHOR_STRIDE)
+            target = self._in_base(arm[still], tool_pose[frame[still], still])
+            at_anchor[index:, still] = self._nearest(arm[still], target, at_anchor[index, still])
+        frame, column = np.nonzero(np.arange(frames)[:, None] <= last)
+        poses, seed = tool_pose[frame, column], _interpolate(frame, column, anchors, at_anchor)
+        joint_pos = self._nearest(arm[column], self._in_base(arm[column], poses), seed)
+        solved = Solution(joint_pos, *_pose_errors(self._reached(arm[column], joint_pos), poses))
+        row = np.zeros((frames, count), int)
+        row[frame, column] = np.arange(len(frame))
+        row = row[np.minimum(np.arange(frames)[:, None], last), columns]
+        return Solution(solved.joint_pos[row], solved.position_error[row], solved.rotation_error[row])
 
     def _in_base(self, arm: np.ndarray, tool_pose: np.ndarray) -> np.ndarray:
         """Tool poses [n 7] seen from the bases of their arms [n]."""
@@ -149,13 +162,14 @@ def arm_solver(robot: RobotSpec, device: str | None = None) -> ArmSolver:
     return ArmSolver(robot, device)
 
 
-def _interpolate(frames: np.ndarray, anchors: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Values [a n d] at anchor frames [a], linearly between them at frames [t]: [t n d]."""
-    after = np.clip(np.searchsorted(anchors, frames), 1, max(1, len(anchors) - 1))
-    if len(anchors) == 1:
-        return np.repeat(values, len(frames), 0)
-    share = (frames - anchors[after - 1]) / (anchors[after] - anchors[after - 1])
-    return values[after - 1] + share[:, None, None] * (values[after] - values[after - 1])
+def _interpolate(frame: np.ndarray, column: np.ndarray, anchors: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Values [a n d] at anchor frames [a n], linearly between them at frames [m] of columns [m]: [m d]."""
+    after = -(-frame // ANCHOR_STRIDE)
+    before = np.maximum(after - 1, 0)
+    first, second = anchors[before, column], anchors[after, column]
+    share = (frame - first) / np.maximum(second - first, 1)
+    start = values[before, column]
+    return start + share[:, None] * (values[after, column] - start)
 
 
 def _segments(robot: RobotSpec, arm: Arm) -> list[np.ndarray]:

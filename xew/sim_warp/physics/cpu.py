@@ -3,7 +3,7 @@
 import mujoco
 import numpy as np
 
-from xew.sim_warp.devices.newton import compile_conversion_quickly
+from xew.sim_warp.devices.newton import convert_quickly
 from xew.sim_warp.physics.worlds import (
     FIRST_OBJECT,
     LEFT_ARM_LINKS,
@@ -28,7 +28,7 @@ _ARMS = ((LEFT_FINGERS, LEFT_ARM_LINKS), (RIGHT_FINGERS, RIGHT_ARM_LINKS))
 
 def simulate_one(world: World) -> Motion:
     """Step one world through its commands."""
-    compile_conversion_quickly()
+    convert_quickly()
     solver = build_solver([world], "cpu", use_mujoco_cpu=True)
     model, data = solver.mj_model, solver.mj_data
     labels = solver.model.shape_label
@@ -58,13 +58,18 @@ def _record_frame(data: mujoco.MjData, owners: np.ndarray, objects: int) -> Fram
     pairs = np.sort(owners[data.contact.geom], axis=-1) if data.ncon else np.zeros((0, 2), int)
     touching = pairs[distance < 0]
     contact = np.zeros((2, objects), bool)
-    held = touching[np.isin(touching[:, 0], (LEFT_FINGERS, RIGHT_FINGERS)) & (touching[:, 1] >= FIRST_OBJECT)]
+    held = touching[_is_either(touching[:, 0], (LEFT_FINGERS, RIGHT_FINGERS)) & (touching[:, 1] >= FIRST_OBJECT)]
     contact[held[:, 0], held[:, 1] - FIRST_OBJECT] = True
     penetration = np.zeros(objects)
     for column in (0, 1):
         deep = (pairs[:, column] >= FIRST_OBJECT) & (pairs[:, 0] != pairs[:, 1])
         np.maximum.at(penetration, pairs[deep, column] - FIRST_OBJECT, -distance[deep])
-    left, right = (np.isin(pairs, arm) for arm in _ARMS)
+    left, right = (_is_either(pairs, arm) for arm in _ARMS)
     wrong = ((left | right).any(1) & (pairs == TABLE).any(1), left.any(1) & right.any(1))
     overlap = np.array([-distance[those].min(initial=0.0) for those in wrong])
     return data.qpos.copy(), data.qvel.copy(), contact, penetration, overlap
+
+
+def _is_either(owners: np.ndarray, two: tuple[int, int]) -> np.ndarray:
+    """Whether each of some owners [...] is one of two; for few of them much faster than `np.isin`."""
+    return (owners == two[0]) | (owners == two[1])

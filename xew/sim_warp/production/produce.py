@@ -1,7 +1,8 @@
 """Scenes made in worker processes: simulated in shares, then rendered and written one scene at a time.
 
 A scene is rendered only if all of its robots succeed: all of them are simulated first. A completed scene is written before
-further simulations begin. On a CPU a share is one robot of one scene, on a GPU a batch of whole scenes.
+further simulations begin. On a CPU a share is one robot of a few scenes, on a GPU a batch of whole scenes. While some workers
+wait for a GPU that steps their batches, the others render and write.
 """
 
 import operator
@@ -23,6 +24,13 @@ from xew.sim_warp.production.episodes import render_cells, write_cell
 from xew.sim_warp.rendering.render import Renderer
 from xew.sim_warp.robots import ROBOTS, RobotSpec
 
+PLANNED_TOGETHER = 16
+"""Largest number of scenes in a CPU's share. Inverse kinematics of 16 paths together takes a fifth of the time."""
+SHARES_PER_WORKER = 4
+"""Least number of a CPU's shares for each worker, so all workers end at about the same time."""
+BATCHES_PER_GPU = 3
+"""Number of batches in flight on a GPU: one is stepped while the models of the next ones are built."""
+
 
 @dataclass(frozen=True)
 class Production:
@@ -38,16 +46,21 @@ class Production:
     """Number of worlds that a GPU steps together."""
     videos: bool = True
     """Whether to store videos; otherwise `rerender.add_videos` makes them from the states."""
+    gpus: int = 1
+    """Number of GPUs that step physics."""
 
     @property
     def physics(self) -> str | None:
         """Warp's name of the device for planning and physics; None for a worker's own."""
         return None if self.gpu_physics else "cpu"
 
-    def shares(self, jobs: Sequence[Job]) -> list[list[Job]]:
-        """The jobs in the shares that one worker simulates at a time."""
+    def shares(self, jobs: Sequence[Job], workers: int = 1) -> list[list[Job]]:
+        """The jobs in the shares that one of some workers simulates at a time."""
         if not self.gpu_physics:
-            return [[replace(job, robots=(robot,))] for job in jobs for robot in job.robots]
+            cells = sum(len(job.robots) for job in jobs)
+            size = max(1, min(PLANNED_TOGETHER, cells // (SHARES_PER_WORKER * workers)))
+            groups = [jobs[first : first + size] for first in range(0, len(jobs), size)]
+            return [share for group in groups for share in _share_by_robot(group)]
         shares: list[list[Job]] = []
         worlds = self.batch
         for job in jobs:
@@ -57,6 +70,12 @@ class Production:
             shares[-1].append(job)
             worlds += len(job.robots)
         return shares
+
+
+def _share_by_robot(jobs: Sequence[Job]) -> list[list[Job]]:
+    """The jobs of each robot."""
+    robots = dict.fromkeys(robot for job in jobs for robot in job.robots)
+    return [[replace(job, robots=(robot,)) for job in jobs if robot in job.robots] for robot in robots]
 
 
 @dataclass
@@ -81,12 +100,17 @@ Outcome = tuple[list[list[Cell]] | list[Record], float]
 def make_scenes(workers: Workers, jobs: Sequence[Job], production: Production) -> Iterator[tuple[list[Record], float]]:
     """Make scenes of different tasks or seeds; yields the headers of a job in the order of its robots, and its time [s]."""
     scenes = {(job.task, job.seed): _Scene(job) for job in jobs}
-    work: deque[Callable[[], Outcome]] = deque(partial(_simulate, share, production) for share in production.shares(jobs))
+    shares = [partial(_simulate, share, production) for share in production.shares(jobs, workers.count)]
+    most = BATCHES_PER_GPU * production.gpus if production.gpu_physics else len(shares)
+    work: deque[Callable[[], Outcome]] = deque(shares[:most])
+    waiting = deque(shares[most:])
     for results, seconds in workers.run(operator.call, work):
         if results and isinstance(results[0], Record):
             records = [record for record in results if isinstance(record, Record)]
             yield records, scenes[records[0].task, records[0].seed].seconds + seconds
             continue
+        if waiting:
+            work.append(waiting.popleft())
         cells = [cell for group in results if isinstance(group, list) for cell in group]
         for cell in cells:
             scene = scenes[cell.task_name, cell.scene.seed]

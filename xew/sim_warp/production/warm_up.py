@@ -4,7 +4,7 @@ Each part runs in a separate process, because Warp compiles products of small ma
 """
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import partial
 
 import numpy as np
@@ -24,29 +24,35 @@ from xew.sim_warp.robots import ROBOTS
 from xew.sim_warp.scene import scene_rng
 from xew.sim_warp.tasks import TASKS
 
-PARTS = ("physics", "kinematics", "rendering")
-"""Parts of the work, by decreasing compile time."""
+PARTS = {
+    "physics": "newton._src.solvers.mujoco.kernels",
+    "kinematics": "_lm_solve_tiled",
+    "rendering": "xew.sim_warp.rendering.shading_kernels",
+}
+"""Parts of the work, by decreasing compile time on a GPU, and a module of kernels that each needs."""
 ROBOT, TASK = "franka_panda", "open_laptop"
 """Robot and task of the smallest jobs; kernels serve all robots and tasks."""
 
 
-def compile_kernels(workers: Workers, device: wp.Device, batch: int, parts: Sequence[str] = PARTS) -> None:
-    """Compile the kernels of some of PARTS, one per worker, unless this kind of device has kernels.
+def compile_on_devices(workers: Workers, devices: Mapping[str, str], batch: int) -> None:
+    """Compile the missing kernels of some of PARTS, each in a worker.
 
-    `batch` is the number of worlds that a GPU steps together; its kernels depend on it.
+    Args:
+        workers: processes.
+        devices: device of each part, by Warp's name.
+        batch: number of worlds that a GPU steps together; its kernels depend on it.
     """
-    if has_kernels(device):
+    missing = [item for item in devices.items() if not has_kernels(wp.get_device(item[1]), PARTS[item[0]])]
+    if not missing:
         return
     print(f"Warp compiles its kernels once, into {wp.config.kernel_cache_dir}")
-    compiled = workers.run(partial(do_smallest_piece, device=device.alias, batch=batch), parts)
-    for _ in tqdm(compiled, desc="compiling kernels", unit="part", total=len(parts)):
+    compiled = workers.run(partial(_compile_part, batch=batch), missing)
+    for _ in tqdm(compiled, desc="compiling kernels", unit="part", total=len(missing)):
         pass
 
 
-def compile_on_devices(workers: Workers, devices: Mapping[str, str], batch: int) -> None:
-    """`compile_kernels` for the device, by Warp's name, of each part."""
-    for name in dict.fromkeys(devices.values()):
-        compile_kernels(workers, wp.get_device(name), batch, [part for part, alias in devices.items() if alias == name])
+def _compile_part(part_and_device: tuple[str, str], batch: int) -> None:
+    do_smallest_piece(*part_and_device, batch)
 
 
 def do_smallest_piece(part: str, device: str, batch: int) -> None:
@@ -57,7 +63,7 @@ def do_smallest_piece(part: str, device: str, batch: int) -> None:
 
 def _solve(robot: RobotSpec, device: wp.Device, batch: int) -> None:
     home = np.array([robot.arms[0].home])
-    arm_solver(robot).solve(0, tool_pose(robot, 0, home), home)
+    arm_solver(robot, device.alias).solve(0, tool_pose(robot, 0, home), home)
 
 
 def standing_world(robot: RobotSpec) -> World:

@@ -1,6 +1,10 @@
 """The default estimators in Warp kernels: the same flow, masks, points and scores as OpenCV's, on a CPU."""
 
+import functools
 from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -12,8 +16,9 @@ from lab.calibration.predictors import Material, delay, predict
 from xew.metrics import mask_iou
 from xew.metrics.backends import ReferenceMasker, Tracker, open_masker, open_tracker
 from xew.metrics.episode_cache import EpisodeCache
-from xew.metrics.estimators.batched import devices
+from xew.metrics.estimators.batched import compiling, devices, flow
 from xew.metrics.estimators.batched import masks as batched_masks
+from xew.metrics.estimators.batched import tracks as batched_tracks
 from xew.metrics.estimators.batched.flow import Search, build_pyramid, find_flow, is_large_enough
 from xew.metrics.estimators.batched.masks import SEARCH as MASK_SEARCH
 from xew.metrics.estimators.batched.masks import BatchedMasker
@@ -212,3 +217,35 @@ def test_a_process_takes_the_first_gpu_that_it_sees(monkeypatch: pytest.MonkeyPa
     assert begun == [gpus[0]], "its context is made while no other thread can find it half made"
     monkeypatch.setattr(wp, "get_cuda_devices", list)
     assert devices.find_gpu() is None
+
+
+def test_kernels_that_are_compiled_ahead_are_those_that_are_launched(truth: Truth, monkeypatch: pytest.MonkeyPatch) -> None:
+    launched: dict[str, set[int]] = {}
+
+    def note(launch: Any, kernel: Any, *arrays: Any, **named: Any) -> None:
+        options = getattr(launch, "keywords", {}) | named
+        launched.setdefault(kernel.module.name, set()).add(options.get("block_dim", compiling.DEFAULT_THREADS))
+        launch(kernel, *arrays, **named)
+
+    for place, name in ((wp, "launch"), (wp, "launch_tiled"), (flow, "_launch"), (batched_tracks, "_launch")):
+        monkeypatch.setattr(place, name, functools.partial(note, getattr(place, name)))
+    video, surfaces = np.ascontiguousarray(predict("8 frames late", Material(truth.rgb))), truth.surfaces
+    assert surfaces is not None
+    BatchedMasker("cpu")(video, truth.rgb, truth.mask)
+    assert launched.keys() == set(compiling.OF_MASKS)
+    BatchedTracker("cpu")(video, truth.rgb, surfaces.robot.pixels, surfaces.robot.visible)
+    assert launched.keys() == set(compiling.OF_TRACKS)
+    assert launched == {name: {compiling.THREADS[name]} for name in compiling.OF_TRACKS}
+
+
+def test_a_module_is_missing_until_the_cache_holds_it_for_the_gpu(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
+    monkeypatch.setattr(wp, "get_cuda_devices", lambda: [SimpleNamespace(arch=90)])
+    module = compiling.OF_MASKS[0]
+    name = wp.get_module(module).get_module_identifier(compiling.THREADS[module])
+    (tmp_path / name).mkdir()
+    for file, missing in (("sm80.cubin", True), ("sm90.cubin", False)):
+        (tmp_path / name / f"{name}.{file}").touch()
+        assert (module in compiling.missing_kernels(compiling.THREADS)) == missing
+    monkeypatch.setattr(wp, "get_cuda_devices", list)
+    assert compiling.missing_kernels(compiling.THREADS) == [], "nothing is compiled without a GPU"
