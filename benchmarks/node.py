@@ -7,7 +7,8 @@
 Every step is a command as users run it, first on one GPU with its share of the cores, then on all (without GPUs: on a quarter
 of the cores, then on all). Parts have their own data, so they may have different sizes; ratios are of rates. A step makes what
 it needs and is not there, and measures that too. Start-up lasts until the first episode, stream, rollout or score is on disk;
-in training it is what the steps at their median time leave over. The training batch is the config's for each GPU.
+in training it is what the steps at their median time leave over. The training batch is the config's for each GPU. On a new
+machine run it on one task into another folder first: that compiles kernels and programs.
 
 `baselines` grades the rollouts and all baselines of the data set, `evaluate` grades a further model on the same data.
 Before a row is printed, its work is checked: numbers of episodes, streams, steps, videos and scores, hashes of a sample of
@@ -157,7 +158,7 @@ def find_parts() -> dict[str, Part]:
 def describe(part: Part) -> str:
     """Text such as `4 x NVIDIA H100 80GB HBM3, 64 cores`."""
     if not part.gpus:
-        return f"{len(part.cores)} CPU cores"
+        return f"{len(part.cores)} CPU core{'s' if len(part.cores) > 1 else ''}"
     query = ("nvidia-smi", "--query-gpu=name", "--format=csv,noheader", "-i", part.gpus[0])
     name = subprocess.run(query, capture_output=True, encoding="utf-8").stdout.strip() or "GPU"
     return f"{len(part.gpus)} x {name}, {len(part.cores)} cores"
