@@ -33,7 +33,7 @@ ELSEWHERE = {"fresh_environments": "tests/test_wheel.py"}
 """Benchmarks that are tried by another file of tests."""
 TINY = f"""--clip.frames 5 --clip.height 64 --clip.width 80 --codec.weights {TINY_CODEC} --model.size tiny --model.action none
   --model.embodiment none --model.history --model.reference frame --model.dtype float32 --train.batch 2 --train.log-every 2
-  --train.optimizer adamw --train.motion-loss-weight 0 --rollout.sampler euler --rollout.steps 2"""
+  --train.optimizer adamw --train.motion-loss-weight 0 --rollout.sampler euler --rollout.steps 2 --rollout.max-frames 5"""
 """Overrides of the recommended recipe."""
 
 

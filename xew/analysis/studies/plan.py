@@ -105,8 +105,8 @@ def count_gpus(step: Step, total: int, free: int, among: int) -> int:
     planned = min(max(1, step.gpus_of(total)), total)
     if not step.may_spread or among == 0:
         return planned
-    counts = range(max(planned, free // among), planned, -1)
-    return next((count for count in counts if count % planned == 0 == step.batch % count), planned)
+    fitting = (count for count in range(free // among, planned, -1) if count % planned == 0 and step.batch % count == 0)
+    return next(fitting, planned)
 
 
 def plan(study: Study) -> dict[str, Step]:
