@@ -1,7 +1,7 @@
 """What changes of the small size's recipe gain, in one run on one GPU: each is trained anew and rolls out validation seeds.
 
     python -m benchmarks.recipe --data data --out recipe                      # short trainings of all that CHANGES lists
-    python -m benchmarks.recipe --data data --changes none --steps 5400 --samplers euler:20 unipc:10 unipc:6
+    python -m benchmarks.recipe --data data --changes none --steps 3000 --samplers euler:20 unipc:8 unipc:4
 
 Needs episodes with validation seeds (`python -m xew.sim_warp.generate --validation-seeds 1 …`); test seeds are not looked at.
 Prints a Markdown table, a line a change and sampler: loss over the last eighth of the steps, LPIPS and PSNR of whole
@@ -29,6 +29,7 @@ import tyro
 CHANGES: dict[str, tuple[str, ...]] = {
     "none": (),
     "no mask, no flow": ("--model.action", "none"),
+    "nothing is carried": ("--model.embodiment", "pasted_render"),
     "render as channels": ("--model.embodiment", "robot_render_channels"),
     "first frame once": ("--model.reference", "frame"),
     "velocity": ("--model.prediction", "velocity"),
@@ -36,7 +37,7 @@ CHANGES: dict[str, tuple[str, ...]] = {
     "all places weigh alike": ("--train.motion-loss-weight", "0"),
     "AdamW": ("--train.optimizer", "adamw"),
     "shift 3": ("--train.shift", "3"),
-    "two chunks": ("--train.chunks", "2", "--train.batch", "2"),
+    "two chunks": ("--train.chunks", "2", "--train.batch", "8"),
 }
 """Overrides of the config by the name of the change."""
 FRAMES = 32
@@ -55,7 +56,7 @@ class Args:
     changes: tuple[str, ...] = tuple(CHANGES)
     """Names in CHANGES."""
     steps: int = 900
-    samplers: tuple[str, ...] = ("unipc:8",)
+    samplers: tuple[str, ...] = ("unipc:4",)
     """Samplers with their number of steps."""
     beside: int = 1
     """Number of trainings at once. Their times tell nothing then."""
