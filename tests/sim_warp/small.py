@@ -79,6 +79,10 @@ class InlineWorkers:
     def __exit__(self, *error: object) -> None:
         pass
 
+    def start(self, function: Callable[[Any], Any], job: Any) -> Callable[[], Any]:
+        result = function(job)
+        return lambda: result
+
     def run(self, function: Callable[[Any], Any], jobs: Sequence[Any]) -> Iterator[Any]:
         waiting = jobs if isinstance(jobs, deque) else deque(jobs)  # to which whoever takes results may add
         while waiting:

@@ -329,8 +329,8 @@ def test_physics_on_the_cpu_leaves_the_gpu_to_the_pictures(
     productions: list[Production] = []
     gpus = [SimpleNamespace(is_cuda=True, alias=f"cuda:{number}", total_memory=1e12) for number in range(2)]
     monkeypatch.setattr(command, "find_devices", lambda name: gpus)
-    monkeypatch.setattr(command, "compile_on_devices", lambda pool, devices, batch: compiled.update(devices))
-    monkeypatch.setattr(command, "make_scenes", lambda pool, jobs, production: productions.append(production) or [])
+    monkeypatch.setattr(command, "compile_on_devices", lambda pool, devices, batch, later: compiled.update(devices))
+    monkeypatch.setattr(command, "make_scenes", lambda pool, jobs, production, _: productions.append(production) or [])
     work_inline(monkeypatch)
     args = Args((TASK,), ("a", "b"), out=tmp_path, batch=8, physics=physics)
     with command.start_workers(args, dict.fromkeys("ab", WITH_SLOW[SLOW])) as make:
@@ -469,6 +469,7 @@ def test_workers_take_what_is_added_while_they_work() -> None:
 
 def test_workers_hand_over_results_and_errors() -> None:
     with Workers(2) as workers:
+        assert workers.start(half, 8)() == 4
         assert sorted(workers.run(half, [2, 4, 6])) == [1, 2, 3]
         with pytest.raises(ConfigError, match="thirteen"):
             list(workers.run(half, [13]))

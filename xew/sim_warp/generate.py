@@ -114,8 +114,8 @@ def start_workers(args: Args, robots: Mapping[str, RobotSpec]) -> Iterator[Calla
     production = Production(args.folder, robots, physics.is_cuda, args.batch, not args.states_only, len(devices))
     with Workers(args.workers or worker_count(devices, physics), devices) as workers:
         parts = {"physics": physics.alias, "kinematics": physics.alias, "rendering": devices[0].alias}
-        compile_on_devices(workers, parts, args.batch)
-        yield lambda jobs: make_scenes(workers, jobs, production)
+        wait_for_renderer = compile_on_devices(workers, parts, args.batch, later="rendering")
+        yield lambda jobs: make_scenes(workers, jobs, production, wait_for_renderer)
 
 
 def generate(args: Args) -> list[Family]:

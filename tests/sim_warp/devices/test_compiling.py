@@ -96,10 +96,16 @@ def test_missing_parts_are_compiled_side_by_side_on_the_devices_that_they_run_on
         (tmp_path / name).parent.mkdir()
         (tmp_path / name).touch()
     started: list[tuple[str, str]] = []
-    pool = SimpleNamespace(run=lambda function, items: started.extend(items) or items)
+    waited: list[tuple[str, str]] = []
+    pool = SimpleNamespace(
+        run=lambda function, items: started.extend(items) or items,
+        start=lambda function, item: started.append(item) or (lambda: waited.append(item)),
+    )
     devices = {"physics": "cpu", "kinematics": "cpu", "rendering": "cuda:0"}
-    warm_up.compile_on_devices(cast(Any, pool), devices, 1)
-    assert started == parts
+    wait = warm_up.compile_on_devices(cast(Any, pool), devices, 1, later="rendering")
+    assert sorted(started) == sorted(parts) and not waited, "the renderer's compilation goes on"
+    wait()
+    assert waited == [part for part in parts if part[0] == "rendering"]
 
 
 def test_inverse_kinematics_are_compiled_for_the_device_of_the_part(monkeypatch: pytest.MonkeyPatch) -> None:

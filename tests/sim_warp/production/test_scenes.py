@@ -17,6 +17,7 @@ from xew.sim_warp.production.produce import Production, make_scenes, simulate_jo
 
 ROBOTS = ("franka_panda", SLOW)
 PRODUCTION = Production(Path("nowhere"), WITH_SLOW)
+CELL = {"task_name": TASK, "scene": SimpleNamespace(seed=0), "robot_name": "piper"}
 
 
 def make(
@@ -50,6 +51,15 @@ def test_a_scene_is_written_as_soon_as_all_robots_are_simulated(monkeypatch: pyt
         [(1, "franka_panda", True), (1, SLOW, False)],
     ]
     assert [seconds for _, seconds in made] == [3, 3]
+
+
+def test_scenes_are_simulated_before_the_renderer_is_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
+    order: list[str] = []
+    monkeypatch.setattr(produce, "_simulate", lambda *_: order.append("simulate") or ([[SimpleNamespace(**CELL)]], 1.0))
+    monkeypatch.setattr(produce, "_write", lambda *_: order.append("write") or ([Record(TASK, 0, "piper", True)], 1.0))
+    pool = cast(Any, InlineWorkers(1))
+    list(make_scenes(pool, [Job(TASK, 0, ("piper",))], PRODUCTION, lambda: order.append("wait")))
+    assert order == ["simulate", "wait", "write"]
 
 
 def test_what_a_robot_of_an_earlier_run_has_failed_stays_rejected(monkeypatch: pytest.MonkeyPatch) -> None:

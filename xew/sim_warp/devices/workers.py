@@ -9,6 +9,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from typing import TypeVar
 
 import warp
@@ -102,6 +103,16 @@ class Workers:
     def __exit__(self, *error: object) -> None:
         self._pool.shutdown(cancel_futures=True)
 
+    def start(self, function: Callable[[Job], Result], job: Job) -> Callable[[], Result]:
+        """Begin one job; returns the function that waits for its result, and raises as `run`."""
+        call = self._pool.submit(function, job)
+
+        def wait_for_result() -> Result:
+            with _tell_killed():
+                return call.result()
+
+        return wait_for_result
+
     def run(self, function: Callable[[Job], Result], jobs: Sequence[Job]) -> Iterator[Result]:
         """Results of `function` on every job, in order of completion.
 
@@ -114,15 +125,21 @@ class Workers:
         """
         waiting = jobs if isinstance(jobs, deque) else deque(jobs)
         under_way: set[Future[Result]] = set()
-        try:
+        with _tell_killed():
             while waiting or under_way:
                 while waiting and len(under_way) < 2 * self.count:  # one waiting job per worker
                     under_way.add(self._pool.submit(function, waiting.popleft()))
                 done, under_way = wait(under_way, return_when=FIRST_COMPLETED)
                 for future in done:
                     yield future.result()
-        except BrokenProcessPool as error:
-            raise EpisodeError(f"{KILLED}, with fewer --workers if it happens again.") from error
+
+
+@contextmanager
+def _tell_killed() -> Iterator[None]:
+    try:
+        yield
+    except BrokenProcessPool as error:
+        raise EpisodeError(f"{KILLED}, with fewer --workers if it happens again.") from error
 
 
 def _begin_worker(device: str | None = None) -> None:

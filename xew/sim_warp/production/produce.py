@@ -97,8 +97,13 @@ Outcome = tuple[list[list[Cell]] | list[Record], float]
 """Simulated cells of each job of a share, or the headers of a written scene; and the time for it [s]."""
 
 
-def make_scenes(workers: Workers, jobs: Sequence[Job], production: Production) -> Iterator[tuple[list[Record], float]]:
-    """Make scenes of different tasks or seeds; yields the headers of a job in the order of its robots, and its time [s]."""
+def make_scenes(
+    workers: Workers, jobs: Sequence[Job], production: Production, wait_for_renderer: Callable[[], object] = list
+) -> Iterator[tuple[list[Record], float]]:
+    """Make scenes of different tasks or seeds; yields the headers of a job in the order of its robots, and its time [s].
+
+    `wait_for_renderer` is called before a scene is rendered. Workers simulate what has been handed out meanwhile.
+    """
     scenes = {(job.task, job.seed): _Scene(job) for job in jobs}
     shares = [partial(_simulate, share, production) for share in production.shares(jobs, workers.count)]
     most = BATCHES_PER_GPU * production.gpus if production.gpu_physics else len(shares)
@@ -117,6 +122,7 @@ def make_scenes(workers: Workers, jobs: Sequence[Job], production: Production) -
             scene.cells.append(cell)
             scene.seconds += seconds / len(cells)
             if len(scene.cells) == len(scene.job.robots):
+                wait_for_renderer()
                 work.appendleft(partial(_write, scene.ordered_cells, scene.job.rejected, production))
 
 

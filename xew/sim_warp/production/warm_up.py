@@ -4,7 +4,7 @@ Each part runs in a separate process, because Warp compiles products of small ma
 """
 
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 
 import numpy as np
@@ -34,21 +34,25 @@ ROBOT, TASK = "franka_panda", "open_laptop"
 """Robot and task of the smallest jobs; kernels serve all robots and tasks."""
 
 
-def compile_on_devices(workers: Workers, devices: Mapping[str, str], batch: int) -> None:
-    """Compile the missing kernels of some of PARTS, each in a worker.
+def compile_on_devices(workers: Workers, devices: Mapping[str, str], batch: int, later: str = "") -> Callable[[], object]:
+    """Compile the missing kernels of some of PARTS, each in a worker. Returns the function that waits for the part `later`.
 
     Args:
         workers: processes.
         devices: device of each part, by Warp's name.
         batch: number of worlds that a GPU steps together; its kernels depend on it.
+        later: a part whose compilation may go on while others begin to work.
     """
     missing = [item for item in devices.items() if not has_kernels(wp.get_device(item[1]), PARTS[item[0]])]
     if not missing:
-        return
+        return list
     print(f"Warp compiles its kernels once, into {wp.config.kernel_cache_dir}")
-    compiled = workers.run(partial(_compile_part, batch=batch), missing)
-    for _ in tqdm(compiled, desc="compiling kernels", unit="part", total=len(missing)):
+    compile_part = partial(_compile_part, batch=batch)
+    going_on = [workers.start(compile_part, item) for item in missing if item[0] == later]
+    first = [item for item in missing if item[0] != later]
+    for _ in tqdm(workers.run(compile_part, first), desc="compiling kernels", unit="part", total=len(first)):
         pass
+    return lambda: [wait() for wait in going_on]
 
 
 def _compile_part(part_and_device: tuple[str, str], batch: int) -> None:
