@@ -58,7 +58,7 @@ docs: $(DOCS)
 	@echo "The site is at site/index.html; its search works when it is served, as by $(BIN)/python -m http.server -d site"
 
 test-fresh: $(STAMP)
-	$(BIN)/python benchmarks/fresh_environments.py
+	$(BIN)/python -m benchmarks.fresh_environments
 
 lint: $(STAMP)
 	$(BIN)/ruff check

@@ -1,6 +1,6 @@
 """Kinematic distances of the five robots over 100 seeds: the time they take, and how far they are from the paper's.
 
-    python benchmarks/distance.py [--seeds 100] [--workers 2] [--limit 20] [--bodies 24]
+    python -m benchmarks.distance [--seeds 100] [--workers 2] [--limit 20] [--bodies 24]
 
 Exits with 1 where it takes longer than the limit in seconds, or where one of the ten distances lies more than two standard
 deviations of one draw from the published one. Then, of some procedural bodies, how much sooner threads measure workspaces than

@@ -16,7 +16,6 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from importlib.metadata import version
 from typing import Annotated, Any
 
 import cv2
@@ -24,6 +23,7 @@ import numpy as np
 import tyro
 import warp as wp
 
+from benchmarks.common import format_versions
 from benchmarks.metrics import Pair, make_pair
 from lab.calibration.predictors import delay, shuffle, soften
 from xew.metrics.backends import ReferenceMasker
@@ -123,7 +123,7 @@ def main(args: Args) -> None:
     cv2.setNumThreads(1)
     wp.config.log_level = wp.LOG_ERROR
     device = wp.get_device("cuda:0" if args.device == "cuda" else "cpu")
-    packages = ", ".join(f"{name} {version(name)}" for name in ("warp-lang", "opencv-python-headless", "numpy"))
+    packages = format_versions(("warp-lang", "opencv-python-headless", "numpy"))
     print(f"{device.name if device.is_cuda else platform.processor()}; {packages}; {args.frames} frames of 320x240")
     pair = make_pair(args.frames)
     videos = make_videos(pair)

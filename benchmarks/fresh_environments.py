@@ -1,6 +1,6 @@
 """The wheel in fresh environments, by every Python of this machine that xew takes: the quickstart of the README.
 
-    python benchmarks/fresh_environments.py [--pythons python3.11 python3.12 python3.13] [--constraints FILE]
+    python -m benchmarks.fresh_environments [--pythons python3.11 python3.12 python3.13] [--constraints FILE]
 
 For each Python: a new virtual environment, the wheel of this repository with what it needs from the package index (the newest
 releases, or those of --constraints), and then, in an empty folder that is not in the clone, the commands of the README's

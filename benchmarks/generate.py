@@ -1,6 +1,6 @@
 """How many episodes a minute: the whole command over all tasks and robots, and where the time of one process goes.
 
-    python benchmarks/generate.py [--device cpu|cuda:0] [--batch 256] [--train-seeds 50 --test-seeds 20] [--states-only]
+    python -m benchmarks.generate [--device cpu|cuda:0] [--batch 256] [--train-seeds 50 --test-seeds 20] [--states-only]
 
 The first figure is that of `python -m xew.sim_warp.generate` with an empty folder, start of processes and failing seeds
 included: episodes of 320x240 frames with scene, robot-only render, states, keypoints and hashes on disk. The second part
@@ -10,23 +10,20 @@ compared with its hash. Kernels should be compiled already: give the command twi
 """
 
 import os
-import platform
 import tempfile
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 import tyro
 import warp as wp
 
+from benchmarks.common import check_episodes, format_versions
 from xew.dataset import find_accepted, find_records
-from xew.episode import Record, verify_episode
 from xew.sim_warp import generate
 from xew.sim_warp.devices.kernels import has_kernels
 from xew.sim_warp.devices.workers import worker_count
@@ -39,8 +36,6 @@ from xew.sim_warp.robots import ROBOTS
 from xew.sim_warp.tasks import TASKS
 
 PACKAGES = ("newton", "mujoco", "mujoco-warp", "warp-lang", "numpy", "av")
-SAMPLE = 200
-"""Number of episodes that are read back and compared with their hashes."""
 
 
 @dataclass(frozen=True)
@@ -49,6 +44,8 @@ class Args:
     """Default: a GPU if Warp finds one."""
     batch: int = 256
     """Number of worlds that a GPU steps together."""
+    tasks: tuple[str, ...] = tuple(TASKS)
+    robots: tuple[str, ...] = tuple(ROBOTS)
     train_seeds: int = 1
     """Number of accepted seeds of each task."""
     test_seeds: int = 0
@@ -67,6 +64,8 @@ def time_command(args: Args, out: Path) -> float:
     begin = time.perf_counter()
     generate.generate(
         generate.Args(
+            tasks=args.tasks,
+            robots=args.robots,
             train_seeds=args.train_seeds,
             test_seeds=args.test_seeds,
             out=out,
@@ -77,20 +76,6 @@ def time_command(args: Args, out: Path) -> float:
         )
     )
     return time.perf_counter() - begin
-
-
-def check(args: Args, out: Path) -> list[Record]:
-    """The headers of all episodes, after the work has been found to be what it is said to be."""
-    accepted = find_accepted(out)
-    expected = len(TASKS) * len(ROBOTS) * (args.train_seeds + args.test_seeds)
-    assert len(accepted) == expected, f"{len(accepted)} episodes, expected {expected}"
-    for _, record in accepted:
-        assert record.success and record.videos == (not args.states_only)
-        assert set(record.hashes) == {"states", "rgb", "robot"}
-    sample = np.unique(np.linspace(0, len(accepted) - 1, SAMPLE).round().astype(int))
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        list(pool.map(verify_episode, [accepted[index][0] for index in sample]))
-    return [record for _, record in accepted]
 
 
 class Clock:
@@ -126,10 +111,12 @@ def run_steps(jobs: list[Job], renderer: Renderer, out: Path, clock: Clock) -> i
     return sum(cell.path.frame_count for cell in cells)
 
 
-def first_jobs(out: Path, count: int) -> list[Job]:
+def first_jobs(args: Args, out: Path) -> list[Job]:
     """The first accepted seeds of each task."""
-    seeds = sorted({(record.task, record.seed) for _, record in find_accepted(out)})
-    return [Job(task, seed, tuple(ROBOTS)) for name in TASKS for task, seed in [s for s in seeds if s[0] == name][:count]]
+    seeds: dict[str, set[int]] = {}
+    for _, record in find_accepted(out):
+        seeds.setdefault(record.task, set()).add(record.seed)
+    return [Job(task, seed, args.robots) for task, found in seeds.items() for seed in sorted(found)[: args.timed_seeds]]
 
 
 def main(args: Args) -> None:
@@ -137,12 +124,13 @@ def main(args: Args) -> None:
     device = wp.get_device(args.device)
     batches = "" if device.is_cpu else f", batches of {args.batch}"
     print(f"{device.name} ({device.alias}), {args.workers or worker_count(device)} processes{batches}, {os.cpu_count()} cores")
-    print(", ".join([f"Python {platform.python_version()}", *(f"{name} {version(name)}" for name in PACKAGES)]))
+    print(format_versions(PACKAGES))
     print("kernels were compiled before" if has_kernels(device) else "kernels are compiled on the way")
     with tempfile.TemporaryDirectory() as folder:
         out = args.out or Path(folder) / "data"
         seconds = time_command(args, out)
-        records = check(args, out)
+        expected = len(args.tasks) * len(args.robots) * (args.train_seeds + args.test_seeds)
+        records = check_episodes(out, expected, videos=not args.states_only)
         frames = sum(record.frame_count for record in records)
         tried = len({(record.task, record.seed) for _, record in find_records(out)})
         size = sum(path.stat().st_size for path in out.rglob("*.*") if path.is_file()) / len(records)
@@ -151,7 +139,7 @@ def main(args: Args) -> None:
             f"generate: {seconds:.1f} s, {60 * len(records) / seconds:.1f} episodes a minute, {frames / seconds:.1f} frames/s"
         )
         if args.timed_seeds:
-            print_steps(first_jobs(out, args.timed_seeds), device, Path(folder) / "steps")
+            print_steps(first_jobs(args, out), device, Path(folder) / "steps")
 
 
 def print_steps(jobs: list[Job], device: wp.Device, out: Path) -> None:

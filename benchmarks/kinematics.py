@@ -1,6 +1,6 @@
 """Forward kinematics of many configurations: our kernel beside pytorch-kinematics and newton.eval_fk, same device, same run.
 
-    python benchmarks/kinematics.py [--device cpu|cuda:0] [--robots franka_panda aloha_agilex] [--configurations N]
+    python -m benchmarks.kinematics [--device cpu|cuda:0] [--robots franka_panda aloha_agilex] [--configurations N]
 
 All three pose every link of the URDF at the same configurations, drawn within the joint limits, in float32, from a
 device array into device arrays. pytorch-kinematics (`pip install 'xew[reference]'`) gives 4 x 4 matrices, Newton and we
@@ -8,11 +8,9 @@ give positions and quaternions; newton.eval_fk computes velocities as well. Befo
 1e-5 in every element of position [m] and rotation matrix. One call is waited for, or twenty back to back (their mean).
 """
 
-import platform
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, version
 from typing import Annotated
 from xml.etree import ElementTree
 
@@ -22,6 +20,7 @@ import tyro
 import warp as wp
 from scipy.spatial.transform import Rotation
 
+from benchmarks.common import format_versions, is_installed
 from xew.sim_warp.kinematics.batched import BatchedKinematics
 from xew.sim_warp.robots import Urdf, get_robot, load_urdf
 
@@ -181,13 +180,6 @@ def median_seconds(run: Callable[[], object], device: str, calls: int) -> float:
     return float(np.median(rounds))
 
 
-def is_installed(name: str) -> bool:
-    try:
-        return bool(version(name))
-    except PackageNotFoundError:
-        return False
-
-
 def race(urdf: Urdf, count: int, device: str, compiled: bool) -> None:
     joint_pos = draw_configurations(urdf, count)
     contenders = [kernel_contender(urdf, joint_pos, device), newton_contender(urdf, joint_pos, device)]
@@ -213,8 +205,8 @@ def race(urdf: Urdf, count: int, device: str, compiled: bool) -> None:
 def main(args: Args) -> None:
     device = wp.get_device(args.device)
     count = args.configurations or (65536 if device.is_cuda else 1024)
-    print(f"{device.name} ({device.alias}), Python {platform.python_version()}, float32")
-    print(", ".join(f"{name} {version(name)}" for name in PACKAGES if is_installed(name)))
+    print(f"{device.name} ({device.alias}), float32")
+    print(format_versions(PACKAGES))
     for key in args.robots:
         race(load_urdf(get_robot(key).urdf), count, device.alias, args.compiled)
 

@@ -1,7 +1,7 @@
 """How long it takes to grade a video: our functions beside what others use for the same numbers, same videos, same run.
 
-    python benchmarks/metrics.py [--frames 121] [--device cpu]        # scikit-image, lpips, OpenCV, fastdtw
-    python benchmarks/metrics.py --device cuda                        # torchmetrics and lpips on the same GPU
+    python -m benchmarks.metrics [--frames 121] [--device cpu]        # scikit-image, lpips, OpenCV, fastdtw
+    python -m benchmarks.metrics --device cuda                        # torchmetrics and lpips on the same GPU
 
 The videos are made here, 320x240: an arm of five links before a textured wall, and the same arm late, off by some degrees,
 blurred and grainy, with its masks and 16 points along the links. On a CPU the peers are scikit-image for PSNR and SSIM, the
@@ -17,13 +17,11 @@ told: by the clock, and of the processors' time, which a busy machine disturbs l
 import functools
 import importlib
 import os
-import platform
 import tempfile
 import time
 import types
 from collections.abc import Callable
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, version
 from typing import Annotated, Any
 
 import cv2
@@ -31,6 +29,7 @@ import jax
 import numpy as np
 import tyro
 
+from benchmarks.common import format_versions, is_installed
 from xew.metrics import METRICS, boundary_f1, lpips, mask_iou, ndtw, psnr, ssim
 from xew.metrics.networks.alexnet import read_alexnet
 
@@ -108,13 +107,6 @@ def draw_arm(wall: np.ndarray, angles: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return frame, mask.astype(bool), points.astype(np.float32)
 
 
-def installed(name: str) -> bool:
-    try:
-        return bool(version(name))
-    except PackageNotFoundError:
-        return False
-
-
 # ---- peers ----
 
 
@@ -153,7 +145,7 @@ def torch_lpips(device: str) -> Callable[[Any, Any], Any]:
     import torch
 
     weights = read_alexnet()
-    if not installed("lpips"):
+    if not is_installed("lpips"):
         print("lpips is not installed; the same network is built in plain PyTorch")
         return plain_lpips(torch, weights, device)
     network = lpips_network(torch)
@@ -215,7 +207,7 @@ def torch_ssim() -> Callable[[Any, Any], Any]:
     """Uniform 7x7 SSIM of [n 3 h w] in [0, 1] by torchmetrics, else in plain PyTorch."""
     import torch
 
-    if installed("torchmetrics"):
+    if is_installed("torchmetrics"):
         function = importlib.import_module("torchmetrics.functional.image").structural_similarity_index_measure
         options = {"gaussian_kernel": False, "kernel_size": 7, "data_range": 1.0, "reduction": "none"}
         return lambda p, t: function(p, t, **options)
@@ -355,7 +347,7 @@ def on_gpu(pair: Pair, rounds: int) -> None:
     expected = theirs(video, 32, tf32=False)
     compare("PSNR and PyTorch [dB]", found[0], expected[0], 1e-3)
     # torchmetrics has other borders and the population's covariance: near, but another number.
-    compare("SSIM and PyTorch", found[1], expected[1], 5e-3 if installed("torchmetrics") else 1e-4)
+    compare("SSIM and PyTorch", found[1], expected[1], 5e-3 if is_installed("torchmetrics") else 1e-4)
     compare("LPIPS and PyTorch in float32", found[2], expected[2], 2e-6)
     there = tuple(torch.as_tensor(v).cuda() for v in video)
     for title, mine, others in (("host to host", video, video), ("of video on the GPU", jax.device_put(video), there)):
@@ -373,8 +365,8 @@ def main(args: Args) -> None:
     if jax.config.jax_compilation_cache_dir is None:  # type: ignore[attr-defined]
         jax.config.update("jax_compilation_cache_dir", os.path.join(tempfile.gettempdir(), "xew-benchmark-jax"))
     kind = jax.devices()[0].device_kind
-    print(f"{kind}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}, Python {platform.python_version()}")
-    print(", ".join(f"{name} {version(name)}" for name in PACKAGES if installed(name)))
+    print(f"{kind}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}")
+    print(format_versions(PACKAGES))
     print(f"{args.frames} frames of {WIDTH}x{HEIGHT}; medians of {args.rounds}; a factor is to ours")
     if args.device not in ("cpu", "cuda") or (args.device == "cuda") != (jax.default_backend() == "gpu"):
         raise SystemExit(

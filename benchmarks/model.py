@@ -1,6 +1,6 @@
 """The reference model beside the PyTorch it comes from: training step, denoising step and autoencoder at full size, one run.
 
-    python benchmarks/model.py [--cases train denoise vae] [--streams 2 3] [--batches 1 2] [--no-peer]
+    python -m benchmarks.model [--cases train denoise vae] [--streams 2 3] [--batches 1 2] [--no-peer]
 
 Random weights of Wan2.2-TI2V-5B's shape, clips of 121 frames at 320x256 (31x8x10 tokens a stream), text of 512 tokens.
 The peer is diffusers in PyTorch: WanTransformer3DModel in bfloat16 with gradient checkpointing, its blocks under torch.compile
@@ -66,17 +66,20 @@ class Args:
     size: str = "wan5b"
     """`tiny` to try the script on a CPU."""
     vae: str = "wan22"
+    """Key of xew.model.codecs.vae.VAES; `tiny` to try the script on a CPU."""
     frames: int = 121
     peer: bool = True
     side: Literal["", "xew", "diffusers"] = ""
     """Run one side in this process (the command calls itself with it)."""
 
 
-def main(args: Args) -> None:
+def main(args: Args) -> int:
+    """Print a row a case and side; the number of those that failed."""
     if args.side:
         for result in (xew_side if args.side == "xew" else diffusers_side)(args):
             print("RESULT " + json.dumps(result), flush=True)
-        return
+        return 0
+    failed = 0
     for case in args.cases:
         for side in ("xew", "diffusers") if args.peer else ("xew",):
             environment = os.environ | {"XLA_PYTHON_CLIENT_MEM_FRACTION": "0.94"}
@@ -86,7 +89,9 @@ def main(args: Args) -> None:
                 for line in process.stdout:
                     tell(json.loads(line[7:])) if line.startswith("RESULT ") else print(line, end="", flush=True)
             if process.returncode:
+                failed += 1
                 print(f"{case}, {side}: ended with {process.returncode}", flush=True)
+    return failed
 
 
 def tell(result: dict[str, Any]) -> None:
@@ -160,12 +165,9 @@ def experiment_of(args: Args, streams: int, batch: int, remat: str, *more: str) 
 
 def forward_flops(experiment: Any, samples: int, **options: Any) -> float:
     from xew.model.network.dit import MODELS
-    from xew.model.network.tokens import token_grid
     from xew.model.training.flops import flops
 
-    grid = token_grid((1, *experiment.inputs.latent_shape))
-    streams = 1 + len(experiment.conditions)
-    return flops(MODELS[experiment.model.size], [grid] * streams, batch=samples, **options)
+    return flops(MODELS[experiment.model.size], experiment.inputs.grids, batch=samples, **options)
 
 
 def check_size(args: Args, parameters: int) -> None:
@@ -450,4 +452,4 @@ def peer_vae(args: Args, where: str) -> Iterator[dict[str, Any]]:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args, description=__doc__))
+    sys.exit(main(tyro.cli(Args, description=__doc__)))

@@ -1,6 +1,6 @@
 """What a batch costs, and how far physics repeats itself: worlds of all tasks and robots stepped together.
 
-    python benchmarks/physics.py [--device cuda:0] [--batches 64 256 1024 4096] [--tasks lift_pot …] [--repeat 200]
+    python -m benchmarks.physics [--device cuda:0] [--batches 64 256 1024 4096] [--tasks lift_pot …] [--repeat 200]
 
 The worlds are those of `generate`: the first seeds of every task on every robot, each along the commands of its expert,
 from the first frame to the last of the longest, with contacts and states recorded at every stored frame. Building (the
@@ -17,16 +17,15 @@ that is let go a hair earlier rolls elsewhere.
 import gc
 import itertools
 import os
-import platform
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib.metadata import version
 
 import numpy as np
 import tyro
 import warp as wp
 
+from benchmarks.common import format_versions
 from xew.sim_warp.physics import simulate
 from xew.sim_warp.physics.gpu import Batch
 from xew.sim_warp.physics.worlds import STEPS_PER_FRAME, Motion, World
@@ -150,8 +149,8 @@ def print_repeatability(device: wp.Device, count: int, batch: int, other_batch: 
 def main(args: Args) -> None:
     """Print both tables."""
     device = wp.get_device(args.device)
-    print(f"{device.name} ({device.alias}), {os.cpu_count()} cores, Python {platform.python_version()}")
-    print(", ".join(f"{name} {version(name)}" for name in PACKAGES))
+    print(f"{device.name} ({device.alias}), {os.cpu_count()} cores")
+    print(format_versions(PACKAGES))
     if args.batches:
         print_table(device, args)
     if args.repeat:

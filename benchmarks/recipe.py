@@ -1,7 +1,7 @@
 """What changes of the small size's recipe gain, in one run on one GPU: each is trained anew and rolls out validation seeds.
 
-    python benchmarks/recipe.py --data data --out recipe                      # short trainings of all that CHANGES lists
-    python benchmarks/recipe.py --data data --changes none --steps 5400 --samplers euler:20 unipc:10 unipc:6
+    python -m benchmarks.recipe --data data --out recipe                      # short trainings of all that CHANGES lists
+    python -m benchmarks.recipe --data data --changes none --steps 5400 --samplers euler:20 unipc:10 unipc:6
 
 Needs episodes with validation seeds (`python -m xew.sim_warp.generate --validation-seeds 1 …`); test seeds are not looked at.
 Prints a Markdown table, a line a change and sampler: loss over the last eighth of the steps, LPIPS and PSNR of whole

@@ -1,6 +1,6 @@
 """How long a frame takes: our two fused passes, and the same outputs by Newton's SensorCamera, same scenes, same run.
 
-    python benchmarks/render.py [--device cpu|cuda:0] [--frames N] [--first 2] [--pictures DIR]
+    python -m benchmarks.render [--device cpu|cuda:0] [--frames N] [--workloads 2] [--pictures DIR]
                                 [--cameras head wrist_left] [--size 640x480]
 
 The workload is what an episode needs from each camera, 320x240 unless --size says otherwise: the scene (two Panda arms and
@@ -13,12 +13,10 @@ Capsules are primitives to it and triangles to us. "kernels" is the time on the 
 the host; on a CPU the two are one. Before a figure is printed, the silhouettes of both are compared.
 """
 
-import platform
 import time
 from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated
 
@@ -30,6 +28,7 @@ import warp as wp
 from newton.sensors import SensorCamera
 from scipy.spatial.transform import Rotation
 
+from benchmarks.common import format_versions, intersection_over_union, label_picture
 from xew.protocol import ARMS
 from xew.sim_warp.cameras import fix_camera, get_camera, place_camera
 from xew.sim_warp.geometry import meshes
@@ -72,8 +71,8 @@ class Args:
     """Number of frames of a batch of ours, 0 for 24 on a CPU and 6144 on a GPU."""
     pictures: Path | None = None
     """Folder for pictures of both side by side, one a workload."""
-    first: int = 0
-    """Workload to begin with: 0 capsules, 1 the robot's own meshes, 2 meshes of 2,000 triangles a link."""
+    workloads: tuple[int, ...] = (0, 1, 2)
+    """0 capsules, 1 the robot's own meshes, 2 meshes of 2,000 triangles a link."""
     cameras: tuple[str, ...] = ("head",)
     """Names of cameras, or files of custom ones."""
     size: str | None = None
@@ -136,7 +135,7 @@ class Workload:
         return World([thing.body for thing in self.robot], self.robot_pose)
 
 
-def workloads(camera_name: str, size: str | None) -> list[Workload]:
+def workloads(camera_name: str = "head", size: str | None = None) -> list[Workload]:
     """Both hands at work over the table, before a camera."""
     robot = ROBOTS["franka_panda"]
     action = np.zeros((FRAMES_PER_WORLD, 16))
@@ -352,11 +351,6 @@ def is_copy(name: str) -> bool:
     return name.startswith("memcpy")
 
 
-def agreement(first: np.ndarray, second: np.ndarray) -> float:
-    """Intersection over union of two masks [h w] bool."""
-    return float((first & second).sum() / (first | second).sum())
-
-
 @dataclass(frozen=True)
 class Cost:
     """Seconds a frame."""
@@ -399,7 +393,8 @@ def race(work: Workload, renderer: Renderer, worlds: int, pictures: Path | None)
     alone = Sensor(work.robot, work.robot_pose, work.camera, False, views, device)
     seen = {"scene": whole.picture(), "robot alone": alone.picture()}
     own = renderer.render_batch([work.scene], work.camera, body=True)[0].body[0] >= 0
-    same = agreement(own, seen["scene"][1]), agreement(command.robot_mask[0], seen["robot alone"][1])
+    pairs = (own, seen["scene"][1]), (command.robot_mask[0], seen["robot alone"][1])
+    same = [intersection_over_union(*pair) for pair in pairs]
     assert min(same) > AGREEMENT, f"the silhouettes agree only to {same[0]:.3f} and {same[1]:.3f}"
     separate = their_cost(whole, views) + their_cost(alone, views)
     print(f"  silhouettes agree to {same[0]:.3f} (scene) and {same[1]:.3f} (robot alone), intersection over union")
@@ -417,10 +412,7 @@ def race(work: Workload, renderer: Renderer, worlds: int, pictures: Path | None)
 def save_pictures(path: Path, panels: dict[str, np.ndarray]) -> None:
     """Write pictures [h w 3] uint8 side by side at twice their size, two a row, with labels."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    labeled = []
-    for label, image in panels.items():
-        image = cv2.resize(np.ascontiguousarray(image), None, fx=2, fy=2, interpolation=cv2.INTER_NEAREST)
-        labeled.append(cv2.putText(image, label, (8, 24), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (200, 0, 0), 1, cv2.LINE_AA))
+    labeled = [label_picture(image, label) for label, image in panels.items()]
     sheet = np.vstack([np.hstack(labeled[row : row + 2]) for row in range(0, len(labeled), 2)])
     if not cv2.imwrite(str(path), cv2.cvtColor(sheet, cv2.COLOR_RGB2BGR)):
         raise OSError(f"{path} cannot be written; choose another folder with --pictures.")
@@ -429,11 +421,12 @@ def save_pictures(path: Path, panels: dict[str, np.ndarray]) -> None:
 def main(args: Args) -> None:
     device = wp.get_device(args.device)
     worlds = max(1, (args.frames or (6144 if device.is_cuda else FRAMES_PER_WORLD)) // FRAMES_PER_WORLD)
-    print(f"{device.name} ({device.alias}), Python {platform.python_version()}")
-    print(", ".join(f"{name} {version(name)}" for name in PACKAGES))
+    print(f"{device.name} ({device.alias})")
+    print(format_versions(PACKAGES))
     renderer = Renderer(device.alias)
     for name in args.cameras:
-        for work in workloads(name, args.size)[args.first :]:
+        found = workloads(name, args.size)
+        for work in (found[number] for number in args.workloads):
             print(f"\ncamera {name}, {work.camera.width}x{work.camera.height}")
             race(work, renderer, worlds, args.pictures)
 

@@ -1,6 +1,6 @@
 """Frames and physics steps a second beside SAPIEN, the engine that RoboTwin's data comes from: one episode, one run.
 
-    python benchmarks/sapien_engine.py [--device cpu|cuda:0] [--task place_empty_cup] [--robot franka_panda] [--pictures DIR]
+    python -m benchmarks.sapien_engine [--device cpu|cuda:0] [--task place_empty_cup] [--robot franka_panda] [--pictures DIR]
 
 An episode of ours is planned and simulated, and its frames are rendered at 320x240 by SAPIEN (`pip install sapien`, a Vulkan
 device is needed) and by us: robot from the same URDF, things from the same meshes, table, wall, ground, lights and camera of
@@ -12,14 +12,12 @@ engine, one world, and on a GPU in MuJoCo Warp. Before a figure is printed, the 
 pictures are compared.
 """
 
-import platform
 import statistics
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -29,6 +27,7 @@ import trimesh
 import tyro
 import warp as wp
 
+from benchmarks.common import format_versions, intersection_over_union, label_picture
 from xew.sim_warp import stage
 from xew.sim_warp.geometry.camera import HEAD_CAMERA
 from xew.sim_warp.geometry.meshes import Mesh
@@ -418,11 +417,6 @@ def measure_our_steps(episode: Episode, worlds: int, device: str) -> float:
     return worlds * (len(long) - len(episode.action)) * STEPS_PER_FRAME / (seconds[1] - seconds[0])
 
 
-def agreement(theirs: np.ndarray, ours: np.ndarray) -> float:
-    """Intersection over union of two masks [h w] bool."""
-    return float((theirs & ours).sum() / (theirs | ours).sum())
-
-
 def to_rgb(image: np.ndarray) -> np.ndarray:
     """SAPIEN's RGBA [h w 4] float32 as RoboTwin stores it: [h w 3] uint8."""
     return (image[..., :3] * 255).clip(0, 255).astype(np.uint8)
@@ -431,10 +425,7 @@ def to_rgb(image: np.ndarray) -> np.ndarray:
 def save_pictures(folder: Path, panels: dict[str, np.ndarray]) -> None:
     """Write pictures [h w 3] uint8 side by side at twice their size, with labels."""
     folder.mkdir(parents=True, exist_ok=True)
-    labeled = []
-    for label, image in panels.items():
-        image = cv2.resize(np.ascontiguousarray(image), None, fx=2, fy=2, interpolation=cv2.INTER_NEAREST)
-        labeled.append(cv2.putText(image, label, (8, 24), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (200, 0, 0), 1, cv2.LINE_AA))
+    labeled = [label_picture(image, label) for label, image in panels.items()]
     cv2.imwrite(str(folder / "sapien.png"), cv2.cvtColor(np.hstack(labeled), cv2.COLOR_RGB2BGR))
 
 
@@ -454,7 +445,7 @@ def compare_frames(args: Args, sapien: Any, episode: Episode, folder: Path, rend
         scene = Theirs(sapien, episode, folder, shader)
         scene.prepare()
         if shader == "default":
-            same = agreement(scene.robot_mask(middle), own_frames.robot_mask[middle])
+            same = intersection_over_union(scene.robot_mask(middle), own_frames.robot_mask[middle])
             assert same > AGREEMENT, f"the robot's silhouettes agree only to {same:.3f}"
             print(f"frame {middle}: the robot's silhouettes agree to {same:.3f} (intersection over union)")
         panels[f"SAPIEN {label}"] = to_rgb(scene.show(middle))
@@ -490,8 +481,8 @@ def compare_steps(args: Args, sapien: Any, episode: Episode, folder: Path, devic
 def main(args: Args) -> None:
     device = wp.get_device(args.device)
     sapien = load_sapien(args)
-    print(f"{device.name} ({device.alias}), Python {platform.python_version()}")
-    print(", ".join(f"{name} {version(name)}" for name in ("sapien", "warp-lang", "newton", "mujoco", "numpy")))
+    print(f"{device.name} ({device.alias})")
+    print(format_versions(("sapien", "warp-lang", "newton", "mujoco", "numpy")))
     print(f"SAPIEN renders on:\n{str(sapien.render.get_device_summary()).strip()}")
     episode = make_episode(args)
     things = sum(len(body.mesh.triangles) for body in episode.things[0])

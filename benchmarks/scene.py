@@ -1,6 +1,6 @@
 """One scene of many bodies: each robot's share by whichever worker is free, beside one process that makes the scene whole.
 
-    python benchmarks/scene.py [--robots body:0-7] [--task place_empty_cup] [--seed 0] [--workers 2] [--repeats 3]
+    python -m benchmarks.scene [--robots body:0-7] [--task place_empty_cup] [--seed 0] [--workers 2] [--repeats 3]
 
 Physics is on the CPU, where `python -m xew.sim_warp.generate` makes scenes robot by robot. Both ways are taken by turns, after
 one scene each in which processes start and kernels load, and the median of the turns is printed with the ratio. Before a

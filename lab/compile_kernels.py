@@ -45,7 +45,7 @@ def main(args: Args) -> None:
     if args.arch not in known:
         raise ConfigError(f"--arch is {args.arch}; Warp's compiler knows {', '.join(map(str, known)) or 'none here'}.")
     with Workers(args.workers) as workers:
-        compiled = workers.run(partial(compile_piece, arch=args.arch, batch=args.batch), PARTS)
+        compiled = workers.run(partial(compile_piece, arch=args.arch, batch=args.batch), list(PARTS))
         modules = sum(tqdm(compiled, desc="compiling kernels", unit="part", total=len(PARTS)))
     print(f"{wp.config.kernel_cache_dir}: {modules} modules for sm_{args.arch}; copy the folder to the GPU's machine")
 

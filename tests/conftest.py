@@ -70,6 +70,7 @@ LONG_FILES = (
     "tests/lab/",
     "tests/test_adding.py",
     "tests/test_docs.py",
+    "tests/test_benchmarks.py",
     "tests/model/training/test_training.py",
     "tests/model/test_pipeline.py",
     "tests/model/test_rollout.py",

@@ -23,7 +23,7 @@ class InlineMachines:
         """Whether nothing is left to be noticed."""
         return not self._ended
 
-    def start(self, step: Step, command: tuple[str, ...], log: Path) -> None:
+    def start(self, step: Step, command: tuple[str, ...], log: Path, among: int) -> None:
         """Do a step, after whoever is still left of it from a killed study; its output lies where a process's would."""
         log.parent.mkdir(parents=True, exist_ok=True)
         with wait_for_lock(log.with_suffix(".lock")):

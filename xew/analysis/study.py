@@ -81,9 +81,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         check_configs([study.experiment])
         slots = len(usable_gpus(study)) or study.machine.workers
         print(format_status(study, steps, ledger), format_cost(study, steps, ledger, slots), sep="\n\n")
-        earlier = args.scores or study.out / "scores.parquet"
-        if args.scores or earlier.exists():
-            print(f"\n{format_power(earlier)}")
+        print(describe_power(args))
         return
     with lock_study(study.out), stop_on_sigterm():
         prepare(study)
@@ -99,12 +97,26 @@ def main(arguments: Sequence[str] | None = None) -> None:
     print(f"{len(left)} steps are left" if left else f"report: {study.out / 'report' / 'index.html'}")
 
 
+def describe_power(args: Args) -> str:
+    """Text on the power of an earlier study's scores, or of the study's own. Raises ConfigError for scores that are named."""
+    own = args.study.out / "scores.parquet"
+    if args.scores is None and not own.exists():
+        return ""
+    try:
+        return f"\n{format_power(args.scores or own)}"
+    except ConfigError as error:
+        if args.scores is not None:
+            raise
+        return f"\n{error}"
+
+
 def run_steps(args: Args, steps: Mapping[str, Step], ledger: Ledger) -> dict[str, str]:
     """Run what is left and wanted, within a time if there is one; returns the steps that failed, with the reason."""
     study, machines = args.study, open_machines(args.study)
     print(format_status(study, steps, ledger), format_cost(study, steps, ledger, machines.slots), sep="\n\n", flush=True)
-    seconds = correct_by_ledger(estimate(study, steps), steps, ledger)
-    budget = None if args.minutes is None else Budget(study, steps, ledger, 60 * args.minutes)
+    slots = max(1, machines.slots)
+    seconds = correct_by_ledger(estimate(study, steps), steps, ledger, slots)
+    budget = None if args.minutes is None else Budget(study, steps, ledger, 60 * args.minutes, slots)
     return StudyRunner(study, steps, ledger, machines, critical_paths(steps, seconds), budget, args.only).run()
 
 

@@ -6,8 +6,14 @@ import pytest
 
 from tests.analysis.studies.chains import ROOT
 from xew.analysis.studies import ledger as study_ledger
-from xew.analysis.studies import merge, processes
+from xew.analysis.studies import merge, processes, rates
 from xew.analysis.studies.config import Study, load_study
+
+
+@pytest.fixture(autouse=True)
+def documented_rates(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Estimates by documented rates, whatever was measured on this machine."""
+    monkeypatch.setattr(rates, "rates_path", lambda: tmp_path / "no_rates.json")
 
 
 @pytest.fixture

@@ -1,6 +1,7 @@
 """The machines of a study: which GPUs a step takes, what it is told of them, launchers and Ray."""
 
 import itertools
+import os
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -71,6 +72,17 @@ def test_gpus_are_shared_out(study: Study) -> None:
     while machine._running:
         machine.wait()
     assert machine.has_room_for(Step("train", "c", (), (), None, study.out, gpus=3))
+
+
+def test_a_step_has_the_cores_of_its_gpus(study: Study) -> None:
+    """Of four GPUs' cores a step on one has a quarter, as far as there are so many; one on all has them all."""
+    cores = sorted(os.sched_getaffinity(0))
+    assert ThisMachine(("0", "1"), 1, {})._cores(("0", "1")) == tuple(cores)
+    machine, log = ThisMachine(("0", "1"), 1, {}), study.out / "a.log"
+    shows = (sys.executable, "-c", "import os; print('cores', sorted(os.sched_getaffinity(0)))")
+    assert machine.start(Step("rollout", "a", (), (), None, study.out, launcher=shows), (), log) == 1
+    machine.wait()
+    assert f"cores {cores[: len(cores) // 2] or cores}" in log.read_text()
 
 
 def test_data_are_made_on_every_gpu(study: Study) -> None:

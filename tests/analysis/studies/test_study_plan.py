@@ -16,13 +16,14 @@ from xew.analysis.studies.cost import (
     critical_paths,
     estimate,
     estimate_wall_seconds,
-    find_rates,
     format_costs,
     format_duration,
+    study_rates,
 )
 from xew.analysis.studies.ledger import Ledger
 from xew.analysis.studies.machines import ThisMachine
 from xew.analysis.studies.plan import Step, plan, sort_steps, source_digest, step_key
+from xew.analysis.studies.rates import Rate
 from xew.analysis.study import main
 from xew.analysis.study_analyse import format_coverage
 from xew.config import ConfigError, merge_settings
@@ -399,22 +400,24 @@ def test_a_training_that_takes_all_gpus_runs_alone() -> None:
 
 def test_the_estimate_adds_up_and_learns(study: Study, tmp_path: Path) -> None:
     study = replace(study, out=tmp_path / "study")
-    steps, rates = plan(study), find_rates(study)
+    steps, rates = plan(study), study_rates(study)
     costs = estimate(study, steps)
-    assert costs["generate"].seconds == rates.start_s + 10 * rates.episode_s
+    assert costs["generate"].seconds() == rates.kinds["generate"].start_s + 10 * rates.kinds["generate"].item_s
+    assert costs["train/fixed-joints-none"].items == 2 * 20, "samples: a batch of two in 20 steps"
     assert costs["rollout/few_shot-piper-1"].amount == 2
     assert costs["train/fixed-joints-none"].amount == study.settings["train"]["steps"]
     ledger = Ledger(study.out)
     before = correct_by_ledger(costs, steps, ledger)
-    assert before == {name: cost.seconds for name, cost in costs.items()}
+    assert before == {name: cost.seconds() for name, cost in costs.items()}
     table = format_costs(study, steps, costs, before, ledger, slots=2)
-    assert table.splitlines()[1].split()[:3] == ["generate", "1", "0"] and rates.machine in table
+    assert table.splitlines()[1].split()[:3] == ["generate", "1", "0"] and rates.text in table
 
 
 def test_the_estimate_warns_of_a_full_disk(study: Study, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     study = replace(study, out=tmp_path)
-    huge = replace(find_rates(study), episode_mb=1e9)
-    monkeypatch.setattr("xew.analysis.studies.cost.find_rates", lambda study: huge)
+    rates = study_rates(study)
+    huge = replace(rates, kinds=rates.kinds | {"generate": Rate(4, 2, item_mb=1e9)})
+    monkeypatch.setattr("xew.analysis.studies.cost.study_rates", lambda study: huge)
     steps = plan(study)
     costs = estimate(study, steps)
     table = format_costs(study, steps, costs, correct_by_ledger(costs, steps, Ledger(tmp_path)), Ledger(tmp_path), slots=1)

@@ -41,17 +41,26 @@ _KNOWN_ROBOTS = tuple(
 Settings = dict[str, Any]
 """A part of an experiment's config, nested as in its file."""
 
+RECIPE: Settings = {
+    "clip": {"frames": 33},
+    "model": {"size": "small"},
+    "train": {"batch": 4, "steps": 7500, "accumulate": 1},
+    "mesh": {"data": -1, "fsdp": 1},
+}
+"""Defaults of xew.model's experiments, which the analysis does not import, as far as costs and devices depend on them."""
+
 
 @dataclass(frozen=True)
 class Machine:
     """Devices that the steps of a study may use."""
 
     gpus: tuple[int, ...] | None = None
-    """Numbers of the GPUs, one step on each; all visible ones where left out; [] is none."""
+    """Numbers of the GPUs; all visible ones where left out; [] is none."""
     workers: int = 1
     """Number of steps at once where there is no GPU."""
-    gpus_per_training: int = 1
-    """Number of GPUs of a training run."""
+    gpus_per_training: int | None = None
+    """Number of GPUs of a training run; where left out, the free GPUs are divided evenly among the training runs that are left
+    and wait for no other run, at least one for each."""
     steps_per_gpu: int = 1
     """Number of steps that share a GPU: at most one training run, and others, which leave it idle while they read and write.
     Above 1 memory is allocated as it is needed."""
@@ -59,6 +68,8 @@ class Machine:
     """Launcher of training commands, such as srun --nodes=2; its processes join by jax.distributed."""
     ray: str | None = None
     """Address of a Ray cluster whose machines share this folder: auto, or host:port. Its resources are used instead."""
+    rates: Path | None = None
+    """File of measured rates for estimates, which `benchmarks/node.py` writes; default: that of this machine, if it exists."""
 
 
 @dataclass(frozen=True)
@@ -259,7 +270,7 @@ def check_study(study: Study, path: Path) -> None:
     except ValueError as error:
         raise ConfigError(f"{path}: machine.train_launcher is {study.machine.train_launcher!r}: {error}.") from error
     for name in ("workers", "gpus_per_training", "steps_per_gpu"):
-        if (count := getattr(study.machine, name)) < 1:
+        if (count := getattr(study.machine, name)) is not None and count < 1:
             raise ConfigError(f"{path}: machine.{name} is {count}; expected at least 1.")
 
 

@@ -1,53 +1,23 @@
 """The cost of a study, before anything starts: time, GPU-hours and disk for every kind of step.
 
-`rates.json` has measured rates by the size of the network; `benchmarks/rates.py` writes an entry from a study. Steps that are
-done correct the estimates of their kind.
+Rates are measured on this machine, or documented (`rates.py`). Steps that are done correct the estimates of their kind.
 """
 
 import heapq
 import math
 import shutil
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from xew.analysis.studies.config import KINDS, Settings, Study, build_experiment
+from xew.analysis.studies.config import KINDS, RECIPE, Settings, Study, build_experiment
 from xew.analysis.studies.ledger import Ledger
-from xew.analysis.studies.machines import TRAININGS, usable_gpus
-from xew.analysis.studies.plan import Step, measured_bodies, sort_steps
-from xew.config import merge_settings, parse, read_yaml
-from xew.files import read_json
+from xew.analysis.studies.machines import usable_gpus
+from xew.analysis.studies.plan import Step, count_gpus, count_sharing, measured_bodies, sort_steps
+from xew.analysis.studies.rates import Rate, Source, find_rates
+from xew.config import merge_settings, read_yaml
 from xew.protocol import BASELINES, ROBOT_NAMES, Variant, training_counts
-
-RATES = Path(__file__).with_name("rates.json")
-RECIPE: Settings = {"clip": {"frames": 33}, "model": {"size": "small"}, "train": {"batch": 4, "steps": 7500}}
-"""Defaults of xew.model's experiments, which the analysis does not import, as far as costs depend on them."""
-
-
-@dataclass(frozen=True)
-class Rates:
-    """Measured times [s] and sizes [MB], by network size."""
-
-    machine: str
-    measured: str
-    """Place and date of the measurement."""
-    episode_s: float
-    encode_s: float
-    """Time to encode one stream of one episode."""
-    step_s: float
-    """Time of one optimizer step, on the GPUs that a training has."""
-    rollout_s: float
-    grade_s: float
-    """Time to grade one video: a predicted episode, or a baseline's."""
-    start_s: float
-    """Time from the start of a command to its first real work, with compilation."""
-    pair_s: float
-    episode_mb: float
-    stream_mb: float
-    run_mb: float
-    rollout_mb: float
-    episode_frames: int
 
 
 @dataclass(frozen=True)
@@ -56,8 +26,14 @@ class Cost:
 
     amount: int
     unit: str
-    seconds: float
+    rate: Rate
+    items: float
+    """Number of items that the rate counts: of a training run the samples of all batches."""
     disk_mb: float = 0.0
+
+    def seconds(self, gpus: int = 1) -> float:
+        """Time on a number of GPUs, or without any."""
+        return self.rate.seconds(self.items, gpus)
 
 
 def find_size(study: Study) -> str:
@@ -66,47 +42,39 @@ def find_size(study: Study) -> str:
     return str(settings["model"]["size"])
 
 
-def find_rates(study: Study) -> Rates:
-    """The rates of the size of the study's network; those of the small one where its size was not measured."""
-    measured, size = read_json(RATES), find_size(study)
-    return parse(Rates, measured.get(size, measured["small"]), f"{RATES}, {size}")
+def study_rates(study: Study) -> Source:
+    """The rates that a study is estimated by. Raises ConfigError for a file of rates that cannot be read."""
+    return find_rates(find_size(study), study.machine.rates)
 
 
 def estimate(study: Study, steps: Mapping[str, Step]) -> dict[str, Cost]:
     """The cost of every step from the study's rates, as if nothing were done."""
-    rates, costs = find_rates(study), {}
+    rates, costs = study_rates(study), dict[str, Cost]()
+
+    def add(name: str, amount: int, unit: str, items: int | None = None, stored: int | None = None) -> None:
+        """Note the cost of a step; `stored` is the number of products on disk, by default one an item."""
+        items = amount if items is None else items
+        rate = rates.kinds[name.partition("/")[0].replace("adapt", "train")]
+        costs[name] = Cost(amount, unit, rate, items, (items if stored is None else stored) * rate.item_mb)
+
     tested = study.task_count * study.test_seeds * len(study.graded_robots)
-    episodes = study.task_count * study.train_seeds * len(study.trained_robots) + tested
-    costs["generate"] = Cost(episodes, "episodes", rates.start_s + episodes * rates.episode_s, episodes * rates.episode_mb)
+    add("generate", study.task_count * study.train_seeds * len(study.trained_robots) + tested, "episodes")
     encoded: dict[tuple[str, str], int] = {}
     for variant in study.planned_runs:
         experiment = build_experiment(study, variant)
-        streams = _count_new_streams(study, variant, experiment, encoded)
         updates, graded = count_optimizer_steps(study, variant, experiment), sum(study.graded_counts(variant).values())
-        costs |= {
-            f"latents/{variant.name}": Cost(
-                streams, "streams", rates.start_s + streams * rates.encode_s, streams * rates.stream_mb
-            ),
-            f"{'adapt' if variant.target else 'train'}/{variant.name}": Cost(
-                updates, "steps", rates.start_s + updates * rates.step_s, rates.run_mb
-            ),
-            f"rollout/{variant.name}": Cost(
-                graded, "episodes", rates.start_s + graded * rates.rollout_s, graded * rates.rollout_mb
-            ),
-            f"evaluate/{variant.name}": Cost(graded, "videos", rates.start_s + graded * rates.grade_s),
-        }
+        samples = updates * merge_settings(RECIPE, experiment)["train"]["batch"]
+        add(f"latents/{variant.name}", _count_new_streams(study, variant, experiment, encoded), "streams")
+        add(f"{'adapt' if variant.target else 'train'}/{variant.name}", updates, "steps", samples, stored=1)
+        add(f"rollout/{variant.name}", graded, "episodes")
+        add(f"evaluate/{variant.name}", graded, "videos")
     for name, (run, _) in study.shifted_runs.items():
         count = study.task_count * study.test_seeds * len([robot for robot in run.seen_robots if robot in study.robot_keys])
-        costs |= {
-            f"generate/{name}": Cost(count, "episodes", rates.start_s + count * rates.episode_s, count * rates.episode_mb),
-            f"rollout/{name}": Cost(count, "episodes", rates.start_s + count * rates.rollout_s, count * rates.rollout_mb),
-            f"evaluate/{name}": Cost(count, "videos", rates.start_s + count * rates.grade_s),
-        }
-    videos = tested * len(BASELINES)
-    costs["baselines"] = Cost(videos, "videos", rates.start_s + videos * rates.grade_s)
-    pairs = math.comb(len(ROBOT_NAMES) + len(measured_bodies(study)), 2)
-    costs["distances"] = Cost(pairs, "pairs", 2 * rates.start_s + pairs * rates.pair_s)
-    costs["analyse"] = Cost(1, "report", 2 * rates.start_s)
+        for kind, unit in (("generate", "episodes"), ("rollout", "episodes"), ("evaluate", "videos")):
+            add(f"{kind}/{name}", count, unit)
+    add("baselines", tested * len(BASELINES), "videos")
+    add("distances", math.comb(len(ROBOT_NAMES) + len(measured_bodies(study)), 2), "pairs")
+    add("analyse", 1, "report")
     return {name: costs[name] for name in steps}
 
 
@@ -128,54 +96,67 @@ def count_optimizer_steps(study: Study, variant: Variant, experiment: Settings) 
     train, clip = experiment["train"], experiment["clip"]
     if not train.get("epochs"):
         return int(train["steps"])
-    chunks = -(-(find_rates(study).episode_frames - 1) // (clip["frames"] - 1))
+    chunks = -(-(study_rates(study).episode_frames - 1) // (clip["frames"] - 1))
     samples = study.training_count(variant) * max(1, chunks - (train.get("chunks", 1) - 1))
     return max(1, round(float(train["epochs"]) * samples / train["batch"]))
 
 
-def correct_by_ledger(costs: Mapping[str, Cost], steps: Mapping[str, Step], ledger: Ledger) -> dict[str, float]:
-    """Seconds of each step: recorded ones if it is done, else the estimate scaled by its error for that kind."""
+def correct_by_ledger(costs: Mapping[str, Cost], steps: Mapping[str, Step], ledger: Ledger, slots: int = 1) -> dict[str, float]:
+    """Seconds of each step: recorded ones if it is done, else the estimate scaled by its error for that kind.
+
+    `slots` is the number of GPUs, of which each step has as many as it is planned with.
+    """
     noted: dict[str, float] = {}
+    expected: dict[str, float] = {}
     for name, step in steps.items():
         record: Mapping[str, Any] = ledger.record(step) if ledger.outcome(name) else {}
         if "seconds" in record:
             noted[name] = record["seconds"]
+            expected[name] = costs[name].seconds(record.get("gpus", step.gpus_of(slots)))
     factors = {}
     for kind in KINDS:
         done = [name for name in noted if steps[name].kind == kind]
-        if done:
-            factors[kind] = sum(noted[name] for name in done) / sum(costs[name].seconds for name in done)
-    return {name: noted.get(name, cost.seconds * factors.get(steps[name].kind, 1.0)) for name, cost in costs.items()}
+        if total := sum(expected[name] for name in done):
+            factors[kind] = sum(noted[name] for name in done) / total
+    planned = {name: cost.seconds(steps[name].gpus_of(slots)) for name, cost in costs.items()}
+    return {name: noted.get(name, seconds * factors.get(steps[name].kind, 1.0)) for name, seconds in planned.items()}
 
 
 def estimate_wall_seconds(
-    steps: Mapping[str, Step], seconds: Mapping[str, float], done: Collection[str], slots: int, steps_per_gpu: int = 1
+    steps: Mapping[str, Step],
+    seconds: Mapping[str, float],
+    done: Collection[str],
+    slots: int,
+    steps_per_gpu: int = 1,
+    speedup: Callable[[str, int], float] = lambda name, gpus: 1.0,
 ) -> float:
     """Time to the end if each step starts as soon as it can, the longest critical path first.
 
     Args:
-        steps, seconds: the study's steps and the time of each.
+        steps, seconds: the study's steps and the time of each, on as many GPUs as it is planned with.
         done: names of steps that need no time.
         slots: number of GPUs, or of steps at once without GPUs.
         steps_per_gpu: number of steps that share a slot, one of them a training run.
+        speedup: factor by which a step is faster on a number of GPUs than as planned.
     """
-    left = {name: {need for need in step.predecessors if need not in done} for name, step in steps.items() if name not in done}
+    left, ended, paths, now = {name for name in steps if name not in done}, set(done), critical_paths(steps, seconds), 0.0
     alone = steps_per_gpu == 1
-    pools = {name: "training" if step.kind in TRAININGS or alone else "other" for name, step in steps.items()}
+    pools = {name: "training" if step.is_training or alone else "other" for name, step in steps.items()}
     free = {"training": slots, "other": slots * (steps_per_gpu - 1)}
-    paths, now = critical_paths(steps, seconds), 0.0
     running: list[tuple[float, str, int]] = []
     while left or running:
-        for name in sorted((name for name, needs in left.items() if not needs), key=lambda name: -paths[name]):
-            needed = min(max(1, steps[name].gpus_of(slots)), slots)
-            if needed <= free[pools[name]]:
-                free[pools[name]] -= needed
-                del left[name]
-                heapq.heappush(running, (now + seconds[name], name, needed))
-        now, ended, needed = heapq.heappop(running)
-        free[pools[ended]] += needed
-        for needs in left.values():
-            needs.discard(ended)
+        ready = sorted((name for name in left if ended.issuperset(steps[name].predecessors)), key=lambda name: -paths[name])
+        for place, name in enumerate(ready):
+            pool = pools[name]
+            among = count_sharing(steps[name], steps, left, ready[place:], ended)
+            needed = count_gpus(steps[name], slots, free[pool], among)
+            if needed <= free[pool]:
+                free[pool] -= needed
+                left.discard(name)
+                heapq.heappush(running, (now + seconds[name] / speedup(name, needed), name, needed))
+        now, last, needed = heapq.heappop(running)
+        free[pools[last]] += needed
+        ended.add(last)
     return now
 
 
@@ -211,12 +192,18 @@ def format_costs(
             amount = f"{sum(costs[name].amount for name in left):,} {costs[names[0]].unit}"
             counts = f"{kind:<10}{len(names):>7}{len(names) - len(left):>7}{amount:>22}"
             lines.append(f"{counts}{hours:>9.2f}{f'{gpu_hours:.2f}' if on_gpus else '':>11}{disk:>8.1f}")
-    rates, shared = find_rates(study), study.machine.steps_per_gpu if on_gpus else 1
-    wall = estimate_wall_seconds(steps, seconds, done, slots, shared)
+
+    def speedup(name: str, gpus: int) -> float:
+        return costs[name].seconds(steps[name].gpus_of(slots)) / costs[name].seconds(gpus) if on_gpus else 1.0
+
+    shared = study.machine.steps_per_gpu if on_gpus else 1
+    wall = estimate_wall_seconds(steps, seconds, done, slots, shared, speedup)
     total = f"{'all':<10}{len(steps):>7}{len(done):>7}{'':>22}{totals[0]:>9.2f}"
     lines.append(f"{total}{f'{totals[1]:.2f}' if on_gpus else '':>11}{totals[2]:>8.1f}")
-    places = f"{slots} GPUs and {shared} steps on each" if shared > 1 else f"{slots} at once"
-    lines.append(f"about {format_duration(wall)} with {places}, by the rates of: {rates.machine} ({rates.measured})")
+    gpus = f"{slots} GPU{'s' if slots > 1 else ''}"
+    places = f"{gpus} and {shared} steps on each" if shared > 1 else gpus if on_gpus else f"{slots} at once"
+    own = "the steps that are done and " if done else ""
+    lines.append(f"about {format_duration(wall)} with {places}, by {own}{study_rates(study).text}")
     free = free_gb(study.out)
     if free < totals[2]:
         lines.append(f"WARNING: {totals[2]:.1f} GB are needed and {free:.1f} GB are free under {study.out}")

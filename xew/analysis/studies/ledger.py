@@ -38,6 +38,7 @@ class _Record:
     outcome: str | None = None
     error: str | None = None
     seconds: float | None = None
+    gpus: int | None = None
     host: str | None = None
 
 
@@ -124,8 +125,8 @@ class Ledger:
         self._write(step, {"key": key, "status": "begun"})
         return goes_on
 
-    def finish(self, step: Step, exit_code: int, seconds: float) -> str:
-        """Note how a step ended; returns what was wrong, or ''."""
+    def finish(self, step: Step, exit_code: int, seconds: float, gpus: int | None = None) -> str:
+        """Note how a step ended, after how long and on how many GPUs; returns what was wrong, or ''."""
         error = "" if exit_code == 0 else f"exit status {exit_code}"
         found = None
         if not error:
@@ -135,7 +136,8 @@ class Ledger:
             except EpisodeError as wrong:
                 error = str(wrong)
         status = {"status": "failed", "error": error} if error else {"status": "done", "outcome": found}
-        self._write(step, {"key": self.key(step), **status, "seconds": round(seconds, 1), "host": socket.gethostname()})
+        used = {} if gpus is None else {"gpus": gpus}
+        self._write(step, {"key": self.key(step), **status, "seconds": round(seconds, 1), **used, "host": socket.gethostname()})
         if found:
             self._outcomes[step.name] = found
         return error

@@ -8,20 +8,18 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any, Protocol
 
 from xew.analysis.studies.config import Study
-from xew.analysis.studies.plan import Step
+from xew.analysis.studies.plan import Step, count_gpus
 from xew.analysis.studies.processes import start_step
 from xew.concurrency import visible_gpus
 from xew.config import TRUST, ConfigError
 
-TRAININGS = ("train", "adapt")
-"""Kinds of steps that keep a GPU busy all the time."""
 GRADINGS = ("baselines", "evaluate")
 """Kinds of steps that keep processors busy, and let those go first that feed a GPU."""
 GRADING_NICENESS = 10
@@ -41,8 +39,11 @@ class Machines(Protocol):
         """Whether a step can be started now."""
         ...
 
-    def start(self, step: Step, command: tuple[str, ...], log: Path) -> None:
-        """Start a step's command, its output appended to `log`."""
+    def start(self, step: Step, command: tuple[str, ...], log: Path, among: int) -> int | None:
+        """Start a step's command, its output appended to `log`; returns its number of GPUs, or None if that is not known.
+
+        Free GPUs are divided among so many steps (`count_sharing`).
+        """
         ...
 
     def wait(self) -> list[tuple[str, int]]:
@@ -60,7 +61,7 @@ def open_machines(study: Study) -> Machines:
     if study.machine.ray:
         return RayCluster(study.machine.ray, environment)
     gpus = usable_gpus(study)
-    needed = study.machine.gpus_per_training
+    needed = study.machine.gpus_per_training or 1
     if gpus and needed > len(gpus):
         raise ConfigError(f"machine.gpus_per_training is {needed}, there are {len(gpus)} GPUs ({', '.join(gpus)}); lower it.")
     if gpus and study.machine.steps_per_gpu > 1:
@@ -81,7 +82,10 @@ class _Running:
 
 
 class ThisMachine:
-    """This machine: one step per GPU, or a training and others; without a GPU as many steps as there are workers."""
+    """This machine: one step per GPU, or a training and others; without a GPU as many steps as there are workers.
+
+    A step with some of the GPUs has the same share of the processor cores.
+    """
 
     def __init__(self, gpus: tuple[str, ...], workers: int, environment: Mapping[str, str], steps_per_gpu: int = 1) -> None:
         self.gpus, self.environment = gpus, dict(environment)
@@ -94,27 +98,36 @@ class ThisMachine:
     def has_room_for(self, step: Step) -> bool:
         return len(self._open_slots(step)) >= self._count_slots(step)
 
-    def _count_slots(self, step: Step) -> int:
-        return max(1, step.gpus_of(self.slots)) if self.gpus else 1
+    def _count_slots(self, step: Step, free: int = 0, among: int = 0) -> int:
+        return count_gpus(step, self.slots, free, among) if self.gpus else 1
+
+    def _cores(self, slots: Sequence[str]) -> tuple[int, ...]:
+        """Processor cores of some GPUs: their equal parts of those that this process may use."""
+        cores, count = sorted(os.sched_getaffinity(0)), len(self._slots)
+        parts = [cores[len(cores) * place // count : len(cores) * (place + 1) // count] for place in range(count)]
+        return tuple(core for slot, part in zip(self._slots, parts, strict=True) if slot in slots for core in part)
 
     def _open_slots(self, step: Step) -> list[str]:
         """Slots that may take a step, the least busy first."""
         steps = {slot: [running.step for running in self._running.values() if slot in running.slots] for slot in self._slots}
         if not self._others_per_gpu:
             return [slot for slot, running in steps.items() if not running]
-        most = 1 if step.kind in TRAININGS else self._others_per_gpu
-        same = {slot: sum((other.kind in TRAININGS) == (step.kind in TRAININGS) for other in steps[slot]) for slot in steps}
+        most = 1 if step.is_training else self._others_per_gpu
+        same = {slot: sum(other.is_training == step.is_training for other in steps[slot]) for slot in steps}
         return sorted((slot for slot in steps if same[slot] < most), key=lambda slot: len(steps[slot]))
 
-    def start(self, step: Step, command: tuple[str, ...], log: Path) -> None:
-        slots = tuple(self._open_slots(step)[: self._count_slots(step)])
+    def start(self, step: Step, command: tuple[str, ...], log: Path, among: int = 0) -> int:
+        free = self._open_slots(step)
+        slots = tuple(free[: self._count_slots(step, len(free), among)])
         own = {"CUDA_VISIBLE_DEVICES": ",".join(slots)} if self.gpus else {}
         shares_gpu = bool(self._others_per_gpu) and step.kind in GRADINGS
         sharing = {name: os.environ.get(name, value) for name, value in SHARING.items()} if shares_gpu else {}
         environment = {**sharing, **self.environment, **step.environment, **own}
         niceness = GRADING_NICENESS if shares_gpu else 0
-        process = start_step(command, log, environment, launcher=step.launcher, niceness=niceness)
+        cores = self._cores(slots) if self.gpus else ()
+        process = start_step(command, log, environment, launcher=step.launcher, niceness=niceness, cores=cores)
         self._running[step.name] = _Running(process, step, slots)
+        return len(slots) if self.gpus else 0
 
     def wait(self) -> list[tuple[str, int]]:
         multiprocessing.connection.wait([running.process.sentinel for running in self._running.values()])
@@ -157,7 +170,7 @@ class RayCluster:
         """True always, since Ray itself lets tasks wait for room."""
         return True
 
-    def start(self, step: Step, command: tuple[str, ...], log: Path) -> None:
+    def start(self, step: Step, command: tuple[str, ...], log: Path, among: int = 0) -> None:
         # A machine that is lost is made up for elsewhere: the same command goes on from what is on disk.
         options: dict[str, Any] = {"num_cpus": 1, "num_gpus": step.gpus if self._gpus else 0, "max_retries": 2}
         task = self._ray.remote(_run_on_ray).options(**options)

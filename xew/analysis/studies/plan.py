@@ -8,8 +8,9 @@ distances _____________________________________________________________|
 
 import hashlib
 import json
+import math
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cache
 from graphlib import TopologicalSorter
@@ -19,10 +20,14 @@ from typing import Any
 import yaml
 
 import xew
-from xew.analysis.studies.config import Run, Settings, Study, build_experiment, run_folder
+from xew.analysis.studies.config import RECIPE, Run, Settings, Study, build_experiment, run_folder
+from xew.config import merge_settings
 from xew.episode import SCHEMA_VERSION
 from xew.files import file_digest, read_text, write_text
 from xew.protocol import DISTANCE_BODIES, GRADING_PROTOCOL, SHARED_MOTION, Variant
+
+TRAININGS = ("train", "adapt")
+"""Kinds of steps that keep a GPU busy all the time."""
 
 
 @dataclass(frozen=True)
@@ -40,6 +45,10 @@ class Step:
     gpus: int = 1
     every_gpu: bool = False
     """Whether it takes all GPUs of its machine instead of a number."""
+    may_spread: bool = False
+    """Whether it takes more than `gpus` if others leave them free (`count_gpus`)."""
+    batch: int = 0
+    """Number that a larger number of GPUs must divide; 0 for none."""
     launcher: tuple[str, ...] = ()
     environment: Mapping[str, str] = field(default_factory=dict)
     after: tuple[str, ...] = ()
@@ -54,9 +63,50 @@ class Step:
     def name(self) -> str:
         return f"{self.kind}/{self.variant}" if self.variant else self.kind
 
+    @property
+    def is_training(self) -> bool:
+        return self.kind in TRAININGS
+
     def gpus_of(self, count: int) -> int:
-        """Number of GPUs that it takes of a machine that has `count`."""
+        """Number of GPUs that it is planned with on a machine that has `count`."""
         return count if self.every_gpu else self.gpus
+
+
+def count_sharing(
+    step: Step, steps: Mapping[str, Step], left: Collection[str], ready: Collection[str], ended: Collection[str]
+) -> int:
+    """Number of steps that a machine's free GPUs are divided among when a step starts; 0: it gets what it is planned with.
+
+    A training run shares them with all others that are left and wait for no other run. Other steps leave free GPUs to
+    training runs until the last one has started, and then share them with all steps that are ready.
+
+    Args:
+        step: the step that starts.
+        steps: all steps of the study.
+        left: names of steps that have not started, this one included.
+        ready: those that could start now.
+        ended: names of steps that are done.
+    """
+    trainings = [steps[name] for name in left if steps[name].is_training]
+    if not step.is_training:
+        return 0 if trainings else len(ready)
+    return sum(all(need in ended for need in other.needs if steps[need].is_training) for other in trainings)
+
+
+def count_gpus(step: Step, total: int, free: int, among: int) -> int:
+    """Number of GPUs that a step takes of a machine: as planned, or a multiple within its share of the free ones.
+
+    Args:
+        step: the step that starts.
+        total: number of the machine's GPUs.
+        free: number of those that are free.
+        among: `count_sharing`.
+    """
+    planned = min(max(1, step.gpus_of(total)), total)
+    if not step.may_spread or among == 0:
+        return planned
+    fitting = (count for count in range(free // among, planned, -1) if count % planned == 0 and step.batch % count == 0)
+    return next(fitting, planned)
 
 
 def plan(study: Study) -> dict[str, Step]:
@@ -145,6 +195,7 @@ def _plan_latents(study: Study, variant: Variant, experiment: Settings, first: s
         # Streams that variants share are encoded by the first of them that is run.
         after=() if started or first == name else (first,),
         every_gpu=first == name and not started,  # all others wait for it
+        may_spread=True,
     )
 
 
@@ -155,6 +206,8 @@ def _training_name(variant: Variant) -> str:
 def _plan_train(study: Study, variant: Variant, experiment: Settings) -> Step:
     joins = ("--distributed",) if study.machine.train_launcher else ()
     before = (_training_name(variant.start),) if variant.start is not None else ()
+    settings = merge_settings(RECIPE, experiment)
+    mesh = settings["mesh"].values()
     return Step(
         _training_name(variant).partition("/")[0],
         variant.name,
@@ -162,7 +215,9 @@ def _plan_train(study: Study, variant: Variant, experiment: Settings) -> Step:
         needs=(f"latents/{variant.name}", *before),
         inputs=_training_inputs(experiment),
         product=run_folder(study, variant),
-        gpus=study.machine.gpus_per_training,
+        gpus=study.machine.gpus_per_training or math.prod(size for size in mesh if size > 0),
+        may_spread=study.machine.gpus_per_training is None and -1 in mesh and not study.machine.train_launcher,
+        batch=settings["train"]["batch"] // settings["train"]["accumulate"],
         launcher=tuple(shlex.split(study.machine.train_launcher)),
     )
 
@@ -179,6 +234,7 @@ def _plan_rollout(study: Study, variant: Variant, experiment: Settings) -> Step:
         needs=("generate", _training_name(variant)),
         inputs=[settings, robots],
         product=out,
+        may_spread=True,
     )
 
 
@@ -223,6 +279,7 @@ def _plan_shift(study: Study, name: str, run: Run, change: str, experiment: Sett
         needs=(made.name, rolled.name),
         inputs=[study.evaluate, GRADING_PROTOCOL, change],
         product=scores,
+        may_spread=True,
     )
     return [made, rolled, graded]
 
@@ -243,6 +300,7 @@ def _plan_baselines(study: Study, variant: Variant, experiment: Settings) -> Ste
         inputs=[frames, study.evaluate, GRADING_PROTOCOL],
         product=out,
         every_gpu=study.machine.steps_per_gpu > 1,  # alone it would wait for all GPUs to be free, or trainings for it
+        may_spread=True,
     )
 
 
@@ -258,6 +316,7 @@ def _plan_evaluate(study: Study, variant: Variant) -> Step:
         needs=("generate", _training_name(variant), f"rollout/{variant.name}"),
         inputs=[study.evaluate, GRADING_PROTOCOL],
         product=out,
+        may_spread=True,
     )
 
 

@@ -40,6 +40,7 @@ def start_step(
     method: Literal["forkserver", "spawn"] = "forkserver",
     launcher: Sequence[str] = (),
     niceness: int = 0,
+    cores: Sequence[int] = (),
 ) -> BaseProcess:
     """Start `python -m command...` in a new process; `.exitcode` is the command's.
 
@@ -50,12 +51,13 @@ def start_step(
         method: forkserver is quick; spawn starts a fresh interpreter.
         launcher: program and arguments that start the command, such as srun.
         niceness: increment of the process's niceness.
+        cores: numbers of the processor cores that it may use; all where left out.
     """
     if method == "forkserver":
         multiprocessing.set_forkserver_preload(list(PRELOADED))
     context = CONTEXTS[method]
     log.parent.mkdir(parents=True, exist_ok=True)
-    given = (tuple(command), log, dict(environment), tuple(launcher), niceness)
+    given = (tuple(command), log, dict(environment), tuple(launcher), niceness, tuple(cores))
     process = context.Process(target=_run, args=given, name=log.stem)
     process.start()
     return process
@@ -71,10 +73,19 @@ def last_lines(log: Path, count: int = 3) -> str:
     return "\n".join([line for line in lines if line and not line.startswith(ENDED)][-count:])
 
 
-def _run(command: tuple[str, ...], log: Path, environment: dict[str, str], launcher: tuple[str, ...], niceness: int) -> None:
+def _run(
+    command: tuple[str, ...],
+    log: Path,
+    environment: dict[str, str],
+    launcher: tuple[str, ...],
+    niceness: int,
+    cores: tuple[int, ...],
+) -> None:
     """Run a module as `python -m` would, or the launcher's process; called in the new process."""
     os.environ.update(environment)
     os.nice(niceness)
+    if cores:
+        os.sched_setaffinity(0, cores)
     os.setpgrp()  # Ctrl-C reaches the study only, which asks its steps to stop
     leave_with_parent(lambda: os.kill(os.getpid(), signal.SIGTERM))
     with open_own(log, "a") as file, wait_for_lock(log.with_suffix(".lock")):

@@ -10,7 +10,7 @@ from xew.analysis.studies.config import Study
 from xew.analysis.studies.cost import correct_by_ledger, critical_paths, estimate, format_duration
 from xew.analysis.studies.ledger import Ledger
 from xew.analysis.studies.machines import Machines
-from xew.analysis.studies.plan import Step
+from xew.analysis.studies.plan import Step, count_sharing
 from xew.dataset import find_accepted
 from xew.protocol import seed_split
 
@@ -30,8 +30,8 @@ class StudyRunner:
     budget: "Budget | None" = None
     """Time after which nothing may run, if there is such a time."""
     only: Collection[str] = ()
-    started: dict[str, float] = field(default_factory=dict)
-    """Start times of the steps that run [s]."""
+    started: dict[str, tuple[float, int | None]] = field(default_factory=dict)
+    """Start times of the steps that run [s], and their numbers of GPUs."""
     settled: int = 0
     failed: dict[str, str] = field(default_factory=dict)
     """Steps that failed, and steps that could not be made because of them, with the reason."""
@@ -67,8 +67,8 @@ class StudyRunner:
                 self.failed[name] = reason
             elif not self.ledger.find_done(step):
                 if self._is_wanted(step) and self.machines.has_room_for(step):
+                    self._start(step, waiting)
                     waiting.discard(name)
-                    self._start(step)
                 continue
             waiting.discard(name)
             ended.append(name)
@@ -84,15 +84,24 @@ class StudyRunner:
             return ""
         return f"needs {missing[0]}"
 
-    def _start(self, step: Step) -> None:
+    def _start(self, step: Step, waiting: Collection[str]) -> None:
         goes_on = self.ledger.begin(step)
-        self.started[step.name] = time.monotonic()
-        self._print_progress(f"{step.name}{', goes on' if goes_on else ''}")
-        self.machines.start(step, complete_command(step, goes_on, self.failed), self.ledger.log(step))
+        command, begin = complete_command(step, goes_on, self.failed), time.monotonic()
+        gpus = self.machines.start(step, command, self.ledger.log(step), self._count_sharing(step, waiting))
+        self.started[step.name] = begin, gpus
+        self._print_progress(f"{step.name}{f' on {gpus} GPUs' if (gpus or 0) > 1 else ''}{', goes on' if goes_on else ''}")
+
+    def _count_sharing(self, step: Step, waiting: Collection[str]) -> int:
+        """Number of steps that the free GPUs are divided among."""
+        ended = {name for name in self.steps if self.ledger.outcome(name)}
+        begun = ended | self.failed.keys() | self.started.keys()
+        left = {name for name, other in self.steps.items() if name not in begun and self._is_wanted(other)}
+        return count_sharing(step, self.steps, left, left.intersection(waiting), ended)
 
     def _finish(self, name: str, code: int) -> str:
-        step, seconds = self.steps[name], time.monotonic() - self.started.pop(name)
-        error = self.ledger.finish(step, code, seconds)
+        begin, gpus = self.started.pop(name)
+        step, seconds = self.steps[name], time.monotonic() - begin
+        error = self.ledger.finish(step, code, seconds, gpus)
         if self.budget is not None and not error:
             self.budget.learn(self.ledger)
         if not error and step.kind == "generate":
@@ -124,15 +133,15 @@ class Budget:
     Training runs come in the order of the plan, adaptations directly after the run that they start from.
     """
 
-    def __init__(self, study: Study, steps: Mapping[str, Step], ledger: Ledger, seconds: float) -> None:
-        self._steps, self._costs = steps, estimate(study, steps)
+    def __init__(self, study: Study, steps: Mapping[str, Step], ledger: Ledger, seconds: float, slots: int = 1) -> None:
+        self._steps, self._costs, self._slots = steps, estimate(study, steps), slots
         self._end = time.monotonic() + seconds
         self._order = {name: place for place, name in enumerate(steps)}
         self.learn(ledger)
 
     def learn(self, ledger: Ledger) -> None:
         """Estimate again, by how long steps of each kind have taken."""
-        seconds = correct_by_ledger(self._costs, self._steps, ledger)
+        seconds = correct_by_ledger(self._costs, self._steps, ledger, self._slots)
         paths = critical_paths({name: step for name, step in self._steps.items() if step.kind != "analyse"}, seconds, own=True)
         self._seconds = seconds | paths
 

@@ -45,7 +45,7 @@ def _format_state(step: Step, ledger: Ledger, failed: Mapping[str, str]) -> str:
 def format_cost(study: Study, steps: Mapping[str, Step], ledger: Ledger, slots: int) -> str:
     """The estimate of what is left."""
     costs = estimate(study, steps)
-    return format_costs(study, steps, costs, correct_by_ledger(costs, steps, ledger), ledger, slots)
+    return format_costs(study, steps, costs, correct_by_ledger(costs, steps, ledger, slots), ledger, slots)
 
 
 def exit_with_failures(failed: Mapping[str, str], ledger: Ledger, steps: Mapping[str, Step]) -> NoReturn:

@@ -81,8 +81,9 @@ def read_ahead(
 
 
 def _open_reader(read: Callable[[Item], Result]) -> Callable[[Item], Result]:
-    from xew.sim_warp.devices.workers import quiet_warp
+    from xew.sim_warp.devices.workers import find_device, keep_memory, quiet_warp
 
     quiet_warp()
+    keep_memory(find_device(None))
     cv2.setNumThreads(1)  # processes share the cores
     return read

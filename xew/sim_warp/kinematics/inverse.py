@@ -104,11 +104,9 @@ class ArmSolver:
         arm, columns = np.broadcast_to(arm, count), np.arange(count)
         last = np.full(count, frames - 1) if lengths is None else lengths - 1
         anchors = np.minimum(np.arange(0, frames + ANCHOR_STRIDE - 1, ANCHOR_STRIDE)[:, None], last)
-        at_anchor = np.repeat(start[None], len(anchors), 0)
+        at_anchor = np.empty((len(anchors), *start.shape))
         for index, frame in enumerate(anchors):
-            still = np.flatnonzero(index * ANCHOR_STRIDE < last + ANCHOR_STRIDE)
-            target = self._in_base(arm[still], tool_pose[frame[still], still])
-            at_anchor[index:, still] = self._nearest(arm[still], target, at_anchor[index, still])
+            start = at_anchor[index] = self._nearest(arm, self._in_base(arm, tool_pose[frame, columns]), start)
         frame, column = np.nonzero(np.arange(frames)[:, None] <= last)
         poses, seed = tool_pose[frame, column], _interpolate(frame, column, anchors, at_anchor)
         joint_pos = self._nearest(arm[column], self._in_base(arm[column], poses), seed)
