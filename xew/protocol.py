@@ -365,7 +365,7 @@ PARTS: dict[str, tuple[Variant, ...]] = {
     # With the conditions of the LOEO folds.
     "halves": tuple(reference(split, *MULTI_VIEW) for split in HALVES),
     # The recommended model, graded on changed scenes (`Study.changes`) as well.
-    "shifts": (reference(action="mask_and_flow_channels", embodiment="pasted_render"),),
+    "shifts": (reference(action="mask_and_flow_channels", embodiment="carried_render"),),
 }
 """Variants that each table compares, in the order of its rows. A variant may be in several parts."""
 PAPER_PARTS = ("fixed", "actions", "ladder", "loeo", "few_shot", "forgetting", "baselines")

@@ -20,19 +20,20 @@ from xew.protocol import VALIDATION_SEED_START
 ROOT = Path(__file__).parents[2]
 SYSTEM = {"out", "model.action", "model.embodiment"}
 FEWSHOT = {"out", "adapt.start_from", "adapt.robots", "train.steps", "train.epochs", "train.optimizer", "train.learning_rate"}
-FEWSHOT |= {"train.warmup_steps", "train.decay_to", "train.ema"}
+FEWSHOT |= {"train.batch", "train.warmup_steps", "train.decay_to", "train.ema"}
 WAN5B = {
     *("out", "cache", "clip.frames", "codec.name", "codec.weights", "codec.dtype", "mesh.data", "mesh.fsdp"),
     *("model.size", "model.action", "model.embodiment", "model.reference", "model.history", "model.visibility"),
     *("model.prediction", "model.weights", "model.text", "model.text_weights", "model.text_tokenizer", "model.remat"),
     *("train.batch", "train.steps", "train.epochs", "train.chunks", "train.optimizer", "train.learning_rate"),
     *("train.warmup_steps", "train.decay_to", "train.ema", "train.motion_loss_weight", "train.log_every", "train.save_every"),
-    *("rollout.sampler", "rollout.steps", "rollout.batch"),
+    *("rollout.sampler", "rollout.steps", "rollout.batch", "train.mu_dtype"),
 }
 DEBUG = {
-    *("out", "clip.frames", "model.size", "model.action", "model.history", "model.dtype", "model.remat"),
-    *("train.steps", "train.optimizer", "train.warmup_steps", "train.ema", "train.motion_loss_weight", "train.log_every"),
-    *("train.save_every", "train.samples", "rollout.sampler", "rollout.steps", "rollout.batch", "rollout.max_frames"),
+    *("out", "clip.frames", "model.size", "model.action", "model.history", "model.dtype"),
+    *("train.batch", "train.steps", "train.optimizer", "train.mu_dtype", "train.warmup_steps", "train.ema"),
+    *("train.motion_loss_weight", "train.log_every", "train.save_every", "train.samples"),
+    *("rollout.sampler", "rollout.batch", "rollout.max_frames"),
 }
 DIFFERS: dict[str, set[str]] = {
     "debug": DEBUG,
@@ -43,7 +44,7 @@ DIFFERS: dict[str, set[str]] = {
     "fewshot/full": FEWSHOT,
     "fewshot/lora": FEWSHOT | {"adapt.lora_rank"},
     "fewshot/replay": FEWSHOT | {"adapt.replay"},
-    "three_views": {"out", "view", "clip.height", "clip.width"},
+    "three_views": {"out", "view", "model.embodiment", "clip.height", "clip.width"},
     "wan5b/fixed": WAN5B,
     "wan5b/fewshot": WAN5B - {"model.weights"} | {"adapt.start_from", "adapt.robots", "train.samples"},
 }

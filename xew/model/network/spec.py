@@ -21,7 +21,7 @@ class NetworkSettings:
     frame, so [-400] is the episode's first frame."""
     dtype: Literal["float32", "bfloat16"] = "bfloat16"
     """Type of the matrix products and of the tokens between blocks; parameters, norms, modulation and sums are float32."""
-    remat: RematName = "dots"
+    remat: RematName = "none"
     """Gradient checkpointing: none, attention, dots or full (blocks.REMAT)."""
     visibility: Visibility = "one_way"
     """joint: all tokens attend to all, as in Wan and FlowWAM. one_way: condition tokens attend to one another only, at noise

@@ -26,7 +26,7 @@ class ModelSettings(NetworkSettings):
     """One of MODELS."""
     action: str = "mask_and_flow_channels"
     """Representation of the commanded motion, one of ACTIONS."""
-    embodiment: str = "pasted_render"
+    embodiment: str = "carried_render"
     """Representation of the robot's appearance, one of CONDITIONS."""
     reference: Literal["frame", "channels"] = "channels"
     """Input of the clip's first frame: latent frame 0 alone, as in Wan, or the channels of every latent frame too, as in
@@ -45,9 +45,9 @@ class ModelSettings(NetworkSettings):
 
 @dataclass(frozen=True)
 class TrainSettings:
-    batch: int = 4
+    batch: int = 16
     """Number of samples of a step, over all devices."""
-    steps: int = 7500
+    steps: int = 3000
     """Number of steps; 0 if `epochs` sets the length."""
     epochs: float = 0.0
     """Number of passes over the training samples; 0 if `steps` sets the length."""
@@ -73,11 +73,11 @@ class TrainSettings:
     """Number of consecutive clips in a sample; the second starts from the predicted end of the first."""
     accumulate: int = 1
     """Number of sequential parts of a batch (gradient accumulation), to save memory."""
-    mu_dtype: Literal["float32", "bfloat16"] = "float32"
+    mu_dtype: Literal["float32", "bfloat16"] = "bfloat16"
     """Type of the optimizer's first moment and of Muon's orthogonalization; bfloat16 saves memory and time
     (docs/performance.md)."""
     log_every: int = 50
-    save_every: int = 2500
+    save_every: int = 1000
     samples: int = 3
     """Number of moments, evenly spaced and the last at the end, at which validation episodes are rolled out and graded for
     TensorBoard; 0 disables them."""
@@ -106,7 +106,7 @@ class RolloutSettings:
     """One of SAMPLERS."""
     noise_schedule: str = "flowwam"
     """One of SCHEDULES, which are named after projects."""
-    steps: int = 8
+    steps: int = 4
     """Number of network evaluations for each chunk."""
     guidance: float = 1.0
     """Classifier-free guidance against `negative_prompt`; 1 disables it. Wan uses 5, but xew trains without dropping
