@@ -40,11 +40,11 @@ from xew.metrics import METRICS
 from xew.metrics.grade import Comparison
 from xew.metrics.grade import grade as grade_video
 from xew.metrics.grading.grade_episodes import read_prediction
-from xew.metrics.grading.list_jobs import list_jobs
+from xew.metrics.grading.list_jobs import Job, list_jobs
 from xew.metrics.grading.open_graders import PROCESSES, open_grader, prepare_process
 from xew.metrics.grading.settings import Args as Settings
-from xew.metrics.grading.settings import resolve
-from xew.rollout import write_rollout
+from xew.metrics.grading.settings import GradingSettings, resolve
+from xew.rollout import Rollout, write_rollout
 
 LATE = 4
 """Number of frames by which the made-up model is late."""
@@ -150,31 +150,37 @@ def time_stages(args: Args) -> dict[str, float]:
     listing = list_jobs(settings)
     job = max(listing.jobs, key=lambda job: job.cell.frames)
     assert job.rollout is not None, "baselines are left out"
-    for _ in range(2):
-        grader = open_grader(settings, {}, threading.Event())
-        seconds: dict[str, float] = {}
-        with timed(seconds, "episode: video, states, points on surfaces"):
-            episode = grader.read_episode([(job, settings.metrics)])
-        with timed(seconds, "the model's video"):
-            video, _ = read_prediction(job, job.rollout, episode.truth, settings.args)
-        comparison = Comparison(video, episode, grader.resources.masker, grader.resources.tracker)
-        with timed(seconds, "colors"):
-            episode.appearance.match(video)
-        with timed(seconds, "masks, with colors"):
-            comparison.estimate_masks()
-        with timed(seconds, "points"):
-            comparison.track("robot_points")
-            comparison.track("keypoints")
-        parts: dict[str, list[str]] = {}
-        for name in settings.metrics:
-            of_network, of_tracks = name.endswith("lpips"), METRICS[name].inputs == "track"
-            kind = "LPIPS" if of_network else "metrics of points" if of_tracks else "other metrics, with masks"
-            parts.setdefault(kind, []).append(name)
-        for kind, names in parts.items():
-            with timed(seconds, kind):
-                grades = grade_video(comparison, names)
-        with timed(seconds, "writing"):
-            settings.store.write(job.cell, grades)
+    grade_by_stages(settings, job, job.rollout)
+    return grade_by_stages(settings, job, job.rollout)
+
+
+def grade_by_stages(settings: GradingSettings, job: Job, rollout: Rollout) -> dict[str, float]:
+    """Seconds of each stage of grading a rollout."""
+    grader = open_grader(settings, {}, threading.Event())
+    seconds: dict[str, float] = {}
+    with timed(seconds, "episode: video, states, points on surfaces"):
+        episode = grader.read_episode([(job, settings.metrics)])
+    with timed(seconds, "the model's video"):
+        video, _ = read_prediction(job, rollout, episode.truth, settings.args)
+    comparison = Comparison(video, episode, grader.resources.masker, grader.resources.tracker)
+    with timed(seconds, "colors"):
+        episode.appearance.match(video)
+    with timed(seconds, "masks, with colors again"):
+        masks = comparison.estimate_masks()
+    with timed(seconds, "points"):
+        comparison.track("robot_points")
+        comparison.track("keypoints")
+    of_points = [name for name in settings.metrics if METRICS[name].inputs == "track"]
+    of_network = [name for name in settings.metrics if name.endswith("lpips")]
+    others = [name for name in settings.metrics if name not in (*of_points, *of_network)]
+    with timed(seconds, "metrics of points"):
+        grades = grade_video(comparison, of_points)
+    comparison = Comparison(video, episode, lambda *_: masks, grader.resources.tracker)
+    for part, names in (("LPIPS", of_network), ("other metrics", others)):
+        with timed(seconds, part):
+            grade_video(comparison, names)
+    with timed(seconds, "writing"):
+        settings.store.write(job.cell, grades)
     return seconds
 
 

@@ -1,5 +1,7 @@
 """The command under way: stopped anywhere it ends in the same bytes, on several devices too, and its memory does not grow."""
 
+import base64
+import json
 import os
 import random
 import shutil
@@ -204,6 +206,22 @@ def test_other_settings_are_graded_anew(world: Path, tmp_path: Path, monkeypatch
     monkeypatch.setattr(settings, "GRADING_PROTOCOL", settings.GRADING_PROTOCOL + 1)
     with pytest.raises(pytest.fail.Exception, match="graded anew"):
         main(Args((world / "rollouts",), world / "data", out, ("psnr",), baselines=False))
+
+
+def test_cells_of_earlier_versions_are_read(
+    world: Path, whole: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Their curves are lists of numbers, null where a frame has no value."""
+    args = arguments(world, tmp_path / "scores.parquet")
+    main(args)
+    for path in graded(args.out, args.data):
+        cell = json.loads(path.read_text())
+        curves = {name: np.frombuffer(base64.b64decode(text), "<f4").tolist() for name, text in cell["curves"].items()}
+        cell["curves"] = {name: [None if np.isnan(value) else value for value in curve] for name, curve in curves.items()}
+        path.write_text(json.dumps(cell))
+    monkeypatch.setattr(grade_episodes, "grade", lambda *_: pytest.fail("graded again"))
+    main(args)
+    assert read_all(args.out) == whole
 
 
 def test_a_damaged_cell_is_graded_anew(world: Path, whole: dict[str, bytes], tmp_path: Path) -> None:

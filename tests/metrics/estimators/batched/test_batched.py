@@ -240,7 +240,7 @@ def test_kernels_that_are_compiled_ahead_are_those_that_are_launched(truth: Trut
 
 def test_a_module_is_missing_until_the_cache_holds_it_for_the_gpu(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
-    monkeypatch.setattr(wp, "get_cuda_devices", lambda: [SimpleNamespace(arch=90)])
+    monkeypatch.setattr(wp, "get_cuda_devices", lambda: [SimpleNamespace(get_cuda_compile_arch=lambda: 90)])
     module = compiling.OF_MASKS[0]
     name = wp.get_module(module).get_module_identifier(compiling.THREADS[module])
     (tmp_path / name).mkdir()

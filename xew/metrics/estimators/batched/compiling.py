@@ -34,7 +34,7 @@ OF_SURFACES = tuple(name for name in THREADS if name.startswith(_RENDERING))
 
 def missing_kernels(modules: Iterable[str]) -> list[str]:
     """The modules, keys of THREADS, that Warp's cache lacks for this machine's GPUs."""
-    archs = {gpu.arch for gpu in _gpus()}
+    archs = {gpu.get_cuda_compile_arch() for gpu in _gpus()}
     return [name for name in dict.fromkeys(modules) if not all(is_compiled(name, arch) for arch in archs)]
 
 
@@ -50,7 +50,7 @@ def _gpus() -> list[wp.Device]:
 
 
 def is_compiled(module: str, arch: int) -> bool:
-    """Whether Warp's cache holds a module, one of THREADS, for GPUs of a compute capability, such as 90."""
+    """Whether Warp's cache holds a module, one of THREADS, compiled for a compute capability, such as 90."""
     importlib.import_module(module)
     name = wp.get_module(module).get_module_identifier(THREADS[module])
     return any(Path(wp.config.kernel_cache_dir, name).glob(f"{name}.sm{arch}*"))
