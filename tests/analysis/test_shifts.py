@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 
 from tests.analysis.test_beyond import write_scores
 from xew.analysis.beyond import Shifts, shifts_frame, shifts_table
-from xew.analysis.beyond.shifts import MODEL
+from xew.analysis.beyond.shifts import MODELS
 from xew.analysis.report import Args, main
 from xew.analysis.scores import Scores, read_scores
 from xew.config import ConfigError
@@ -18,7 +19,10 @@ from xew.protocol import HELD_OUT_ROBOTS, SEEN_ROBOTS, TEST_SEED_START
 
 SCENES = [(task, TEST_SEED_START + i) for task in ("place_empty_cup", "beat_block_hammer") for i in range(8)]
 COSTS = {"light:1": 0.0, "light:3": 0.05, "height:2": 0.02}
-"""What each change adds to the model's LPIPS."""
+"""What each change adds to the LPIPS of the first model."""
+MODEL, REMEDY = MODELS
+SHARES = {MODEL: 1.0, REMEDY: 0.5}
+"""The share of these costs that each model pays: training under changes halves them."""
 NEW = dict(zip(HELD_OUT_ROBOTS, (0.1, 0.03), strict=True))
 """What each unseen robot adds."""
 
@@ -36,13 +40,14 @@ def rows(errors: Mapping[str, float], scenes: list[tuple[str, int]], **cell: str
 
 @pytest.fixture(scope="module")
 def tables(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Path]]:
-    """A study's table, and one of each change; of the lower table the first scene is missing."""
+    """A study's table, and one of each change and model; of the lower table the first scene is missing."""
     root = tmp_path_factory.mktemp("shifts")
-    unchanged = write_scores(root / "scores.parquet", rows(dict.fromkeys(SEEN_ROBOTS, 0.0) | NEW, SCENES, variant=MODEL.name))
-    paths = []
-    for change, cost in COSTS.items():
+    own = [row for model in MODELS for row in rows(dict.fromkeys(SEEN_ROBOTS, 0.0) | NEW, SCENES, variant=model)]
+    unchanged, paths = write_scores(root / "scores.parquet", own), []
+    for (change, cost), (model, share) in product(COSTS.items(), SHARES.items()):
         scenes = SCENES[1:] if change.startswith("height") else SCENES
-        path = write_scores(root / f"{change.replace(':', '_')}.parquet", rows(dict.fromkeys(SEEN_ROBOTS, cost), scenes))
+        graded = rows(dict.fromkeys(SEEN_ROBOTS, share * cost), scenes, model=model)
+        path = write_scores(root / f"{model}@{change.replace(':', '_')}.parquet", graded)
         frame = pd.read_parquet(path)
         frame.attrs |= {"change": change}
         frame.to_parquet(path, index=False)
@@ -58,26 +63,40 @@ def read(tables: tuple[Path, list[Path]]) -> tuple[Scores, list[Scores]]:
 def test_costs_are_paired_over_the_scenes_that_all_have(read: tuple[Scores, list[Scores]]) -> None:
     shifts = Shifts(*read)
     assert shifts.scenes == len(SCENES) - 1 and shifts.changes == ["light:1", "light:3", "height:2"]
-    found = shifts_frame(shifts, "lpips").set_index("case")
-    for case, cost in (NEW | COSTS).items():
-        assert found.loc[case, "value"] == pytest.approx(cost, abs=1e-6)
-        assert found.loc[case, "high"] - found.loc[case, "low"] < 1e-5, "the spread over scenes cancels"
-    mean = shifts.mean("", "lpips")
+    found = shifts_frame(shifts, "lpips").set_index(["trained_in", "case"])
+    for (model, share), (case, cost) in product(SHARES.items(), (NEW | COSTS).items()):
+        row = found.loc[MODELS[model], case]
+        assert row["value"] == pytest.approx(cost if case in NEW else share * cost, abs=1e-6)
+        assert row["high"] - row["low"] < 1e-5, "the spread over scenes cancels"
+    mean = shifts.mean(REMEDY, "", "lpips")
     assert mean is not None and mean.count == 3 * shifts.scenes
+
+
+def test_a_model_without_its_own_scores_is_left_out(read: tuple[Scores, list[Scores]]) -> None:
+    scores, shifted = read
+    for left in (MODEL, REMEDY):
+        alone = Shifts(replace(scores, rows=scores.rows[scores.rows["variant"] == left]), shifted)
+        assert alone.models == [left] and len(shifts_frame(alone, "lpips")) == len(NEW | COSTS)
+    assert not Shifts(replace(scores, rows=scores.rows.assign(variant="another")), shifted).models
 
 
 def test_the_table_marks_what_costs_something(read: tuple[Scores, list[Scores]]) -> None:
     table = shifts_table(Shifts(*read))
-    rows = {row.labels[0]: row.cells[0] for section in table.sections for row in section.rows}
-    assert [cell.verdict for cell in rows.values()] == ["", "worse", "worse", "unresolved", "worse", "worse"]
-    assert list(rows)[3:] == ["light, level 1", "light, level 3", "height, level 2"]
+    rows = {row.labels: row.cells[0] for section in table.sections for row in section.rows}
+    for scenes in ("unchanged scenes", "randomly changed scenes"):
+        own = {new: cell.verdict for (new, trained), cell in rows.items() if trained == scenes}
+        assert list(own.values()) == ["", "worse", "worse", "unresolved", "worse", "worse"]
+        assert list(own)[3:] == ["light, level 1", "light, level 3", "height, level 2"]
 
 
 def test_tables_that_do_not_compare_are_refused(read: tuple[Scores, list[Scores]]) -> None:
     scores, shifted = read
-    for wrong in ([*shifted, shifted[0]], [*shifted, scores]):
-        with pytest.raises(ConfigError, match="expected one without a change, and one of each change"):
+    unchanged = replace(shifted[0], attributes={**shifted[0].attributes, "change": ""})
+    for wrong in ([*shifted, shifted[0]], [*shifted[1:], unchanged]):
+        with pytest.raises(ConfigError, match="expected one without a change, and one of each change and model"):
             Shifts(scores, wrong)
+    with pytest.raises(ConfigError, match=f"are of another; expected {MODEL} or {REMEDY}"):
+        Shifts(scores, [replace(shifted[0], rows=shifted[0].rows.assign(model="another"))])
     other = replace(shifted[0], attributes={**shifted[0].attributes, "protocol": 99})
     with pytest.raises(ConfigError, match="differ in protocol from the unchanged"):
         Shifts(scores, [other])

@@ -110,6 +110,14 @@ def test_every_view_has_a_video_by_robotwin_s_name(data: Path, tmp_path: Path) -
         export(Args(few, tmp_path / "other", views=("side",)))
 
 
+def test_an_episode_carries_its_change(data: Path, exported: Path, tmp_path: Path) -> None:
+    for (folder, record), change in zip(find_accepted(data), ("light:5", "clutter:40"), strict=False):
+        write_episode(tmp_path / "data", replace(record, change=change), read_states(folder), read_video(folder / "rgb.mkv"))
+    export(Args(tmp_path / "data", tmp_path / "out"))
+    assert parquet.read_table(tmp_path / "out/meta/episodes")["xew/change"].to_pylist() == ["light:5", "clutter:40"]
+    assert "xew/change" not in parquet.read_table(exported / "meta/episodes").column_names
+
+
 def test_a_red_block_stays_red(tmp_path: Path) -> None:
     video = np.full((4, HEIGHT, WIDTH, 3), 255, np.uint8)
     video[:, 80:160, 100:200] = (200, 30, 20)

@@ -100,7 +100,7 @@ class Args:
     other_motion: Path | None = None
     """Score table of the same study in the other kind of motion, to compare action representations."""
     shifted: tuple[Path, ...] = ()
-    """Score tables of the model of the part `shifts` on changed scenes, one for each change."""
+    """Score tables of the models of the part `shifts` on changed scenes, one for each change and model."""
     explorer: bool = False
     """Write <out>/explorer too, a page that plays the scenes of the strips, for the report of one run."""
     paper: bool = False

@@ -16,6 +16,7 @@ from xew.analysis import report
 from xew.analysis.scores import TRAINING, VARIANT, Scores, merge_scores, write_scores
 from xew.analysis.studies.config import Study, load_study
 from xew.config import ConfigError, admit, demand_admitted, load, user_errors
+from xew.dataset import view_folder
 from xew.files import check_place, hold_lock, remove_written
 from xew.protocol import TASK_COUNT, TEST_SEEDS_PER_TASK, TRAIN_SEEDS_PER_TASK, expected_counts
 
@@ -73,7 +74,7 @@ def merge_and_report(args: Args, study: Study) -> None:
         raise ConfigError(f"{root} has no folder of a graded variant, such as {shown[0]}; name the folder that holds them.")
     if len(rollouts) < len(shown):
         print(f"{len(shown) - len(rollouts)} of {len(shown)} variants are in no picture: their rollouts were not under {root}")
-    data = args.data or (study.data_folder if rollouts else None)
+    data = args.data or (view_folder(study.data_folder, study.view) if rollouts else None)
     table, out = args.study / "scores.parquet", args.study / "report"
     check_place(out / "index.html", within=args.study)
     remove_written(out, report.FILES)  # a larger study's figures would stay

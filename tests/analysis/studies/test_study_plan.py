@@ -176,28 +176,78 @@ def test_the_report_is_made_anew_when_the_study_in_the_other_motion_has_scores(s
     assert plan(beside)["analyse"].inputs != before and beside.other_scores == tmp_path / "scores.parquet"
 
 
-def test_changed_scenes_are_made_predicted_and_graded_for_one_model() -> None:
+def test_changed_scenes_are_made_once_and_predicted_and_graded_for_both_models() -> None:
     study = load_study(CONFIGS / "study_shifts.yaml", ["--training-seeds", "0", "1"])
     steps = plan(study)
-    name = PARTS["shifts"][0].name
-    assert len(study.shifted_runs) == 18 and len(steps) == 3 + 4 * 2 + 3 * 18, "of the first training alone"
-    lamp, table = (steps[f"generate/{name}@{change}"].command for change in ("light_2", "height_3"))
+    name, remedy = (variant.name for variant in PARTS["shifts"])
+    assert len(study.shifted_runs) == 36 and len(steps) == 3 + 4 * 4 + 1 + 18 + 2 * 36, "of the first training of each"
+    lamp, table = (steps[f"generate/data_{change}"].command for change in ("light_2", "height_3"))
     assert lamp[0] == "xew.sim_warp.inspect" and lamp[-4:] == ("--change", "light:2", "--out", "studies/shifts/data_light_2")
     assert table[0] == "xew.sim_warp.generate" and table[12:16] == ("--train-seeds", "0", "--test-seeds", "6")
-    rollout, grading = steps[f"rollout/{name}@light_2"], steps[f"evaluate/{name}@light_2"]
-    assert rollout.needs == (f"generate/{name}@light_2", f"train/{name}") and grading.name in steps["analyse"].needs
-    robots = rollout.command[rollout.command.index("--robots") + 1 : rollout.command.index("--out")]
-    assert (
-        robots == SEEN_ROBOTS
-        and "studies/shifts/data_light_2" in rollout.command
-        and "studies/shifts/data" not in rollout.command
-    )
-    assert str(study.scores_path(f"{name}@light_2")) in grading.command
-    assert estimate(study, steps)[f"rollout/{name}@light_2"].amount == 6 * 6 * 3
+    for model in (name, remedy):
+        rollout, grading = steps[f"rollout/{model}@light_2"], steps[f"evaluate/{model}@light_2"]
+        assert rollout.needs == ("generate/data_light_2", f"train/{model}") and grading.name in steps["analyse"].needs
+        robots = rollout.command[rollout.command.index("--robots") + 1 : rollout.command.index("--out")]
+        assert robots == SEEN_ROBOTS and rollout.command[rollout.command.index("--data") + 1] == "studies/shifts/data_light_2"
+        assert str(study.scores_path(f"{model}@light_2")) in grading.command
+        assert "studies/shifts/data" in steps[f"rollout/{model}"].command, "unchanged test scenes for both"
+    costs = estimate(study, steps)
+    assert costs[f"rollout/{name}@light_2"].amount == costs["generate/data_light_2"].amount == 6 * 6 * 3
     few = load_study(CONFIGS / "study_shifts.yaml", ["--changes", "clutter:1"])
-    assert list(few.shifted_runs) == [f"{name}@clutter_1"] and not load_study(DEBUG).shifted_runs
+    assert list(few.shifted_runs) == [f"{name}@clutter_1", f"{remedy}@clutter_1"] and not load_study(DEBUG).shifted_runs
     with pytest.raises(ConfigError, match="unknown change of scenes 'light:4'"):
         load_study(CONFIGS / "study_shifts.yaml", ["--changes", "light:4"])
+
+
+def test_the_remedy_trains_on_randomly_changed_scenes_of_its_own() -> None:
+    study = load_study(CONFIGS / "study_shifts.yaml")
+    steps, (first, remedy) = plan(study), PARTS["shifts"]
+    made = steps["generate/data_random"]
+    assert made.command[-4:] == ("--change", "random", "--out", "studies/shifts/data_random") and not made.needs
+    counted = made.command.index("--robots"), made.command.index("--physics")
+    assert made.command[slice(*counted)] == ("--robots", *SEEN_ROBOTS, "--train-seeds", "40", "--test-seeds", "0")
+    own, other = (build_experiment(study, variant) for variant in (remedy, first))
+    folders = {"data": "studies/shifts/data_random", "cache": "studies/shifts/latents_random"}
+    assert own == other | folders | {"out": f"studies/shifts/runs/{remedy.name}"}
+    latents = steps[f"latents/{remedy.name}"]
+    assert latents.needs == (made.name,) and latents.product == Path(folders["cache"]) and not latents.after
+    costs = estimate(study, steps)
+    assert costs[made.name].amount == 6 * 40 * 3
+    assert costs[latents.name].amount == costs[f"latents/{first.name}"].amount > 0, "nothing is shared"
+    alone = plan(replace(study, variants=(first.name,)))
+    assert made.name not in alone and len(alone) == 3 + 4 + 3 * 18
+
+
+def test_a_view_is_rendered_trained_and_graded_in_every_step(study: Study) -> None:
+    plain, steps = plan(study), plan(load_study(DEBUG, ["--view", "wrist_left"]))
+    variant = study.planned_variants[0].name
+    assert steps.keys() == plain.keys()
+    for name, option in (("generate", "--cameras"), ("baselines", "--view"), (f"evaluate/{variant}", "--view")):
+        command = steps[name].command
+        assert command[command.index(option) + 1] == "wrist_left" and option not in plain[name].command
+    for name in ("generate", "baselines", f"latents/{variant}", f"train/{variant}"):
+        assert steps[name].inputs != plain[name].inputs
+    seen = replace(load_study(CONFIGS / "study_shifts.yaml"), view="front")
+    shifted = plan(seen)
+    assert build_experiment(seen, PARTS["shifts"][1])["view"] == "front" and "view" not in plain[f"train/{variant}"].inputs
+    for name in ("generate/data_random", "generate/data_light_1", f"evaluate/{PARTS['shifts'][0].name}@light_1"):
+        assert "front" in shifted[name].command
+
+
+@pytest.mark.parametrize(
+    ("config", "view", "message"),
+    [
+        ("study_debug.yaml", "wrist_lef", "unknown view 'wrist_lef'; did you mean 'wrist_left'"),
+        (
+            "study_shifts.yaml",
+            "wrist_right",
+            "the camera wrist_right moves with the robot, and fixed-mask_and_flow.* stands still",
+        ),
+    ],
+)
+def test_a_view_that_cannot_be_predicted_is_refused(config: str, view: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        load_study(CONFIGS / config, ["--view", view])
 
 
 def test_every_training_seed_is_a_training_of_every_variant(study: Study) -> None:

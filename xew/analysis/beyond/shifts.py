@@ -1,7 +1,8 @@
-"""Scores of one model on changed scenes and on unseen robots: whether a new robot or a new lamp costs more."""
+"""Scores of models on changed scenes and on unseen robots: whether a new robot or a new lamp costs more, and the remedy."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pandas as pd
@@ -12,63 +13,69 @@ from xew.analysis.tables.builder import interval_ends, mean_cell
 from xew.analysis.tables.labels import ROBOT_TITLES
 from xew.analysis.tables.table import Column, Table, TableCell, TableRow, TableSection, metric_title
 from xew.config import ConfigError
-from xew.protocol import BASELINES, FACTORS, PARTS
+from xew.protocol import FACTORS, PARTS
 from xew.statistics import LEVEL, Mean, combine, noise_floor, strict_metrics, verdict
 
 METRICS = ("lpips", "mask_iou", "pck", "trajectory_error")
 """Metrics of the table; a strict metric replaces the paper's."""
-MODEL = PARTS["shifts"][0]
-"""The variant that is graded on changed scenes."""
-SEEN = pooled(MODEL, "seen")
+MODELS = {variant.name: f"{'randomly changed' if variant.change else 'unchanged'} scenes" for variant in PARTS["shifts"]}
+"""The variants that are graded on changed scenes, and what each was trained in."""
+ROBOTS = PARTS["shifts"][0]
+"""The variant whose robots are those of all."""
+SEEN = pooled(ROBOTS, "seen")
 SCENE, CELL = ["task", "seed"], ["task", "seed", "robot"]
 
 
 class Shifts:
-    """The model's scores with each change on its training robots, and without one on all robots, over common scenes.
+    """Scores of MODELS with each change on their training robots, and without one on all robots, over common scenes.
 
-    Only its first training run is graded on changed scenes, so intervals are over scenes.
-    Raises ConfigError if a table has no change, two have the same, or they were graded differently.
+    Only the first training run of each is graded on changed scenes, so intervals are over scenes.
+    Raises ConfigError if a table has no change, two have the same of one model, or they were graded differently.
     """
 
     def __init__(self, scores: Scores, shifted: Sequence[Scores]) -> None:
-        tables = {table.change: table for table in shifted}
-        if len(tables) < len(shifted) or "" in tables or scores.change:
+        pairs = [(model, table.change) for table in shifted for model, _ in table.models]
+        graded = {model for model, _ in pairs}  # a run's rollouts have its name as their model
+        if unknown := sorted(graded - set(MODELS)):
+            raise ConfigError(f"the tables of changed scenes are of {', '.join(unknown)}; expected {' or '.join(MODELS)}.")
+        if len(set(pairs)) < len(pairs) or not all(table.change for table in shifted) or scores.change:
             found = ", ".join(table.change or "no change" for table in (scores, *shifted))
             raise ConfigError(
-                f"the tables of changed scenes have {found}; expected one without a change, and one of each change."
+                f"the tables of changed scenes have {found}; expected one without a change, and one of each change and model."
             )
         for key in (key for key in COMPARABLE if key != "change"):
             if any(table.attributes.get(key) != scores.attributes.get(key) for table in shifted):
                 raise ConfigError(f"the tables of changed scenes differ in {key} from the unchanged; grade them alike.")
-        self.changes = sorted(tables, key=lambda change: (FACTORS.index(change.partition(":")[0]), change))
         self.metrics: Mapping[str, MetricInfo] = {metric.name: metric for metric in scores.metrics}
-        own = _first_training(scores.rows[(scores.rows[VARIANT] == MODEL.name) | (scores.rows["model"] == TRUTH)])
-        rows = {change: table.rows[~table.rows["model"].isin(list(BASELINES))] for change, table in tables.items()}
-        common = own[own[VARIANT] == MODEL.name][CELL].drop_duplicates()
-        common = common[common["robot"].isin(SEEN)]
-        for changed in rows.values():
-            common = common.merge(changed[CELL].drop_duplicates())
-        parts = [own.merge(common[SCENE].drop_duplicates(), on=SCENE)]
-        parts += [part.merge(common, on=CELL).assign(**{VARIANT: _named(change)}) for change, part in rows.items()]
+        self.models = [name for name in MODELS if name in graded.intersection(scores.rows[VARIANT])]
+        own = _first_training(scores.rows[scores.rows[VARIANT].isin(self.models) | (scores.rows["model"] == TRUTH)])
+        changed = pd.concat([table.rows.assign(change=table.change) for table in shifted])
+        changed = changed[changed["model"].isin(self.models)]
+        changed = changed.assign(**{VARIANT: changed["model"] + " " + changed["change"]})
+        self.changes = sorted(set(changed["change"]), key=lambda change: (FACTORS.index(change.partition(":")[0]), change))
+        common = own.loc[own["robot"].isin(SEEN), CELL].drop_duplicates()
+        for _, rows in [*own[own[VARIANT] != ""].groupby(VARIANT), *changed.groupby(VARIANT)]:
+            common = common.merge(rows[CELL].drop_duplicates())
+        parts = [own.merge(common[SCENE].drop_duplicates(), on=SCENE), changed.merge(common, on=CELL)]
         merged = pd.concat(parts, ignore_index=True).assign(**{TRAINING: 0})
         self._grades = StudyGrades(merged, tuple(scores.metrics), {}, assumed_spread=0.0)
         self.scenes = len(common[SCENE].drop_duplicates())
 
-    def mean(self, case: str, metric: str) -> Mean | None:
-        """Mean score of a case: a change on the training robots, an unseen robot, or empty for the training robots."""
+    def mean(self, model: str, case: str, metric: str) -> Mean | None:
+        """Mean score in a case: a change on its training robots, an unseen robot, or empty for the training robots."""
         if case in self.changes:
-            return self._grades.variant_mean(_named(case), SEEN, metric)
-        return self._grades.variant_mean(MODEL.name, (case,) if case else SEEN, metric)
+            return self._grades.variant_mean(f"{model} {case}", SEEN, metric)
+        return self._grades.variant_mean(model, (case,) if case else SEEN, metric)
 
-    def cost(self, case: str, metric: str) -> Mean | None:
+    def cost(self, model: str, case: str, metric: str) -> Mean | None:
         """Difference of a case from the training robots in unchanged scenes, paired by scene; None if one was not graded."""
-        means = self.mean(case, metric), self.mean("", metric)
+        means = self.mean(model, case, metric), self.mean(model, "", metric)
         return combine(np.subtract, means[0], means[1]) if means[0] and means[1] else None
 
     @property
     def cases(self) -> dict[str, str]:
         """Titles of all cases that are compared with the training robots in unchanged scenes."""
-        robots = {robot: f"{ROBOT_TITLES[robot]}, never seen" for robot in MODEL.held_out_robots}
+        robots = {robot: f"{ROBOT_TITLES[robot]}, never seen" for robot in ROBOTS.held_out_robots}
         return robots | {change: change.replace(":", ", level ") for change in self.changes}
 
     def floor(self, metric: str) -> float:
@@ -78,42 +85,45 @@ class Shifts:
 
 
 def shifts_table(shifts: Shifts) -> Table:
-    """Unseen robots and all changes, with marks for differences from the training robots in unchanged scenes."""
+    """Unseen robots and all changes by model, with marks for differences from the training robots in unchanged scenes."""
     strict = strict_metrics(shifts.metrics)
     shown = [name for metric in METRICS if (name := strict.get(metric, metric)) in shifts.metrics]
 
-    def row(case: str, title: str) -> TableRow:
-        return TableRow((title,), tuple(_cell(shifts, case, metric) for metric in shown))
+    titles = {"": "nothing is new"} | shifts.cases
 
-    titles = shifts.cases
-    sections = [TableSection("Training robots, unchanged scenes", (row("", "nothing is new"),))]
-    sections.append(
-        TableSection("A new robot", tuple(row(case, titles[case]) for case in titles if case not in shifts.changes))
-    )
+    def section(title: str, cases: Iterable[str]) -> TableSection:
+        rows = [(case, model) for case in cases for model in shifts.models]
+        cells = [tuple(_cell(shifts, *row, metric) for metric in shown) for row in rows]
+        labels = [(titles[case], MODELS[model]) for case, model in rows]
+        return TableSection(title, tuple(map(TableRow, labels, cells)))
+
+    sections = [section("Training robots, unchanged scenes", [""]), section("A new robot", ROBOTS.held_out_robots)]
     for factor in FACTORS:
-        rows = tuple(row(change, titles[change]) for change in shifts.changes if change.startswith(f"{factor}:"))
-        sections += [TableSection(f"Training robots, {factor} changed", rows)] if rows else []
+        changes = [change for change in shifts.changes if change.startswith(f"{factor}:")]
+        sections += [section(f"Training robots, {factor} changed", changes)] if changes else []
     return Table(
         "shifts",
         "What costs more: a new robot or a new lamp",
-        f"One training run on {shifts.scenes} scenes that all rows share. Marks: compared with the first row, paired by scene.",
-        ("what is new",),
+        f"One training run of each model on {shifts.scenes} scenes that all rows share. Marks: compared with the same model "
+        "where nothing is new, paired by scene. Models have no marks against each other, which would need more training runs.",
+        ("what is new", "trained in"),
         tuple(Column(metric_title(shifts.metrics[metric])) for metric in shown),
         tuple(sections),
     )
 
 
 def shifts_frame(shifts: Shifts, metric: str) -> pd.DataFrame:
-    """Costs by a metric: table case, title, value, low, high; NaN if not graded."""
-    costs = [(case, title, shifts.cost(case, metric)) for case, title in shifts.cases.items()]
-    rows = [
-        (case, title, *((cost.value, *interval_ends(cost, LEVEL)) if cost else (np.nan,) * 3)) for case, title, cost in costs
-    ]
-    return pd.DataFrame(rows, columns=["case", "title", "value", "low", "high"])
+    """Costs by a metric: table trained_in, case, title, value, low, high; NaN if not graded."""
+    rows = []
+    for model, (case, title) in product(shifts.models, shifts.cases.items()):
+        cost = shifts.cost(model, case, metric)
+        ends = (cost.value, *interval_ends(cost, LEVEL)) if cost else (np.nan,) * 3
+        rows.append((MODELS[model], case, title, *ends))
+    return pd.DataFrame(rows, columns=["trained_in", "case", "title", "value", "low", "high"])
 
 
-def _cell(shifts: Shifts, case: str, metric: str) -> TableCell:
-    info, mean, cost = shifts.metrics[metric], shifts.mean(case, metric), shifts.cost(case, metric)
+def _cell(shifts: Shifts, case: str, model: str, metric: str) -> TableCell:
+    info, mean, cost = shifts.metrics[metric], shifts.mean(model, case, metric), shifts.cost(model, case, metric)
     if mean is None or cost is None:
         return TableCell()
     mark = verdict(cost.value, cost.interval(), shifts.floor(metric), info.higher_is_better) if case else ""
@@ -125,7 +135,3 @@ def _first_training(rows: pd.DataFrame) -> pd.DataFrame:
     if TRAINING not in rows:
         return rows
     return rows[rows[TRAINING] == rows.groupby(VARIANT)[TRAINING].transform("min")]
-
-
-def _named(change: str) -> str:
-    return f"{MODEL.name} {change}"

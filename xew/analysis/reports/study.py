@@ -113,7 +113,7 @@ class Others:
     motion: Scores | None = None
     """The same study in the other kind of motion."""
     shifted: Sequence[Scores] = ()
-    """The model of the part `shifts` on changed scenes, one table for each change."""
+    """The models of the part `shifts` on changed scenes, one table for each change and model."""
 
 
 @dataclass(frozen=True)
@@ -174,6 +174,7 @@ def build(
     tables += filter(None, (difficulty_table(difficulty, grades.metrics), gaps_table(gaps, grades.metrics)))
     motions = Motions(scores, others.motion) if others.motion else None
     shifts = Shifts(scores, others.shifted) if others.shifted else None
+    shifts = shifts if shifts and shifts.models else None
     tables += [*([motion_table(motions)] if motions else []), *([shifts_table(shifts)] if shifts else [])]
     # A study that has none of the paper's parts is asked none of its claims.
     of_paper = any(builder.has_results(part) for part in PAPER_PARTS)

@@ -106,20 +106,20 @@ def motion_chart(motions: Motions) -> Chart:
 
 
 def shifts_chart(shifts: Shifts) -> Chart:
-    """Costs in LPIPS of unseen robots and of changed scenes, as bars."""
+    """Costs in LPIPS of unseen robots and of changed scenes, as bars of each model."""
     data, metric = shifts_frame(shifts, METRIC), shifts.metrics[METRIC]
+    colors = dict(zip(data["trained_in"].unique(), SERIES, strict=False))
 
     def draw(axes: Axes) -> None:
-        values = data[["value", "low", "high"]].to_numpy()
-        charts.bars(axes, data["title"].tolist(), [(SERIES[0], values, np.full(len(data), np.nan))], metric.title)
-        for bar, case in zip(axes.patches, data["case"], strict=True):
-            bar.set_color(SERIES[0] if case in shifts.changes else SERIES[1])
+        costs = [(color, data.loc[data["trained_in"] == scenes, ["value", "low", "high"]]) for scenes, color in colors.items()]
+        groups = [(color, values.to_numpy(), np.full(len(values), np.nan)) for color, values in costs]
+        charts.bars(axes, list(shifts.cases.values()), groups, metric.title)
 
     caption = (
-        "What an unseen robot, and each change of the scene on training robots, adds to the LPIPS of training robots in "
-        "unchanged scenes. Lines: 95 % intervals."
+        "What an unseen robot, and each change of the scene on training robots, adds to the same model's LPIPS on training "
+        "robots in unchanged scenes. Lines: 95 % intervals."
     )
-    legend = [Series("unseen robot", SERIES[1]), Series("changed scene", SERIES[0])]
+    legend = [Series(f"trained in {scenes}", color) for scenes, color in colors.items()]
     height = PANEL[1] * (0.3 + len(data) / SHIFTS_OF_A_PANEL)
     return Chart("shifts", caption, [Panel(f"Added {metric.title}", draw, height)], data, legend)
 

@@ -24,11 +24,13 @@ from xew.protocol import (
     MULTI_VIEW,
     PARTS,
     ROBOT_NAMES,
+    SHARED_MOTION,
     SPLITS,
     UNSEEN_BODIES,
     VARIANTS,
     Variant,
     reference,
+    split_key,
 )
 from xew.statistics import (
     ASSUMED_SPREAD,
@@ -158,7 +160,7 @@ def row_keys(part: str, variant: Variant) -> list[str]:
         return [variant.system]
     if part in ("ladder", "few_shot"):
         return [variant.embodiment]
-    return [variant.action if part == "actions" else variant.split]
+    return [variant.action if part == "actions" else split_key(variant.split, SHARED_MOTION, variant.change)]
 
 
 def variants_of(part: str) -> tuple[Variant, ...]:

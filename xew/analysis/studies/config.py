@@ -12,7 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from xew.config import ConfigError, check_finite, load, merge_settings, read_yaml, suggestion
+from xew.model.conditions import CONDITIONS, list_conditions, shows_carried
 from xew.protocol import (
+    HEAD,
     MOTIONS,
     PAPER_PARTS,
     PARTS,
@@ -133,7 +135,9 @@ class Study:
     motion: str = SHARED_MOTION
     """Kind of motion of all episodes, one of protocol.MOTIONS."""
     changes: tuple[str, ...] = ()
-    """Changes of the test scenes, such as light:2, on which the model of the part `shifts` is graded; all where left out."""
+    """Changes of the test scenes, such as light:2, on which the models of the part `shifts` are graded; all where left out."""
+    view: str = HEAD
+    """View that all models predict and are graded on: the name of a camera, such as wrist_left."""
     other_motion: Path | None = None
     """Folder of the same study in the other kind of motion; the report compares action representations of both."""
     generate: tuple[str, ...] = ()
@@ -152,6 +156,10 @@ class Study:
     @property
     def data_folder(self) -> Path:
         return self.out / "data"
+
+    def folder_of(self, name: str, change: str) -> Path:
+        """Folder of the data or latents of scenes with a change or without one: data, data_light_2, latents_random."""
+        return self.out / split_key(name, SHARED_MOTION, change)
 
     @property
     def baselines_path(self) -> Path:
@@ -221,6 +229,17 @@ class Study:
         runs = [run for run in self.planned_runs if run.name in (variant.name for variant in PARTS["shifts"])]
         return {f"{run.name}@{change.replace(':', '_')}": (run, change) for run in runs for change in asked}
 
+    @property
+    def planned_changes(self) -> dict[str, dict[str, int]]:
+        """The changes that scenes are made with, and the numbers of their seeds by family: training scenes, or test scenes."""
+        trained = {variant.change: {"train": self.train_seeds} for variant in self.planned_variants if variant.change}
+        return trained | {change: {self.test_family: self.test_seeds} for _, change in self.shifted_runs.values()}
+
+    @property
+    def shifted_robots(self) -> tuple[str, ...]:
+        """Robots in changed scenes: those that the models of the part `shifts` train on."""
+        return tuple(robot for robot in PARTS["shifts"][0].seen_robots if robot in self.robot_keys)
+
     def count_trainings(self, variant: Variant) -> int:
         """Number of trainings of a variant."""
         return max(len(self.training_seeds), 1) if self._is_repeated(variant) else 1
@@ -260,6 +279,7 @@ def check_study(study: Study, path: Path) -> None:
     _check_names(study, path)
     if not study.planned_variants:
         raise ConfigError(f"{path}: no variant of the parts {', '.join(study.parts)} is left; widen variants, robots or shots.")
+    _check_view(study, path)
     shots = max((variant.shots for variant in study.planned_variants), default=0)
     if study.train_seeds < max(shots, 1) or study.test_seeds < 1:
         raise ConfigError(
@@ -304,6 +324,24 @@ def _check_names(study: Study, path: Path) -> None:
                 )
 
 
+def _check_view(study: Study, path: Path) -> None:
+    """Raises ConfigError for a view of no built-in camera, or of one that moves where a variant needs one that stands still."""
+    if study.view == HEAD:
+        return
+    from xew.sim_warp.cameras import CAMERAS  # loads Warp
+
+    if study.view not in CAMERAS:
+        raise ConfigError(f"{path}: unknown view {study.view!r};{suggestion(study.view, CAMERAS)} known: {', '.join(CAMERAS)}.")
+    carried = {name for name, entry in CONDITIONS.items() if shows_carried(list_conditions(entry))}
+    still = [variant.name for variant in study.planned_variants if variant.embodiment in carried]
+    if CAMERAS[study.view].moves and still:
+        cameras = ", ".join(name for name, camera in CAMERAS.items() if not camera.moves)
+        raise ConfigError(
+            f"{path}: the camera {study.view} moves with the robot, and {', '.join(still)} needs one that stands still "
+            f"({cameras}); choose one of them, or other parts or variants."
+        )
+
+
 def build_experiment(study: Study, variant: Variant) -> Settings:
     """The config of one variant's experiment, plain as in a file."""
     settings = merge_settings(read_yaml(study.experiment), study.settings)
@@ -316,15 +354,16 @@ def build_experiment(study: Study, variant: Variant) -> Settings:
     if isinstance(variant, Run) and variant.seed is not None:
         settings = merge_settings(settings, {"train": {"seed": variant.seed}})
     given = {
-        "data": str(study.data_folder),
+        "data": str(study.folder_of("data", variant.change)),
         "out": str(run_folder(study, variant)),
-        "cache": str(study.out / "latents"),
+        "cache": str(study.folder_of("latents", variant.change)),
         "split": split_key(variant.split, study.motion),
         "model": {
             "action": variant.action,
             "embodiment": variant.embodiment,
         },
     }
+    given |= {"view": study.view} if study.view != settings.get("view", HEAD) else {}
     return merge_settings(settings, given)
 
 

@@ -14,7 +14,7 @@ from typing import Any
 from xew.analysis.studies.config import KINDS, RECIPE, Settings, Study, build_experiment
 from xew.analysis.studies.ledger import Ledger
 from xew.analysis.studies.machines import usable_gpus
-from xew.analysis.studies.plan import Step, count_gpus, count_sharing, measured_bodies, sort_steps
+from xew.analysis.studies.plan import Step, count_gpus, count_sharing, generate_name, measured_bodies, sort_steps
 from xew.analysis.studies.rates import Rate, Source, find_rates
 from xew.config import merge_settings, read_yaml
 from xew.protocol import BASELINES, ROBOT_NAMES, Variant, training_counts
@@ -59,7 +59,7 @@ def estimate(study: Study, steps: Mapping[str, Step]) -> dict[str, Cost]:
 
     tested = study.task_count * study.test_seeds * len(study.graded_robots)
     add("generate", study.task_count * study.train_seeds * len(study.trained_robots) + tested, "episodes")
-    encoded: dict[tuple[str, str], int] = {}
+    encoded: dict[tuple[str, ...], int] = {}
     for variant in study.planned_runs:
         experiment = build_experiment(study, variant)
         updates, graded = count_optimizer_steps(study, variant, experiment), sum(study.graded_counts(variant).values())
@@ -68,23 +68,25 @@ def estimate(study: Study, steps: Mapping[str, Step]) -> dict[str, Cost]:
         add(f"{'adapt' if variant.target else 'train'}/{variant.name}", updates, "steps", samples, stored=1)
         add(f"rollout/{variant.name}", graded, "episodes")
         add(f"evaluate/{variant.name}", graded, "videos")
-    for name, (run, _) in study.shifted_runs.items():
-        count = study.task_count * study.test_seeds * len([robot for robot in run.seen_robots if robot in study.robot_keys])
-        for kind, unit in (("generate", "episodes"), ("rollout", "episodes"), ("evaluate", "videos")):
-            add(f"{kind}/{name}", count, unit)
+    shown = study.task_count * len(study.shifted_robots)
+    for change, counts in study.planned_changes.items():
+        add(generate_name(study, change), shown * sum(counts.values()), "episodes")
+    for name in study.shifted_runs:
+        add(f"rollout/{name}", shown * study.test_seeds, "episodes")
+        add(f"evaluate/{name}", shown * study.test_seeds, "videos")
     add("baselines", tested * len(BASELINES), "videos")
     add("distances", math.comb(len(ROBOT_NAMES) + len(measured_bodies(study)), 2), "pairs")
     add("analyse", 1, "report")
     return {name: costs[name] for name in steps}
 
 
-def _count_new_streams(study: Study, variant: Variant, experiment: Settings, encoded: dict[tuple[str, str], int]) -> int:
+def _count_new_streams(study: Study, variant: Variant, experiment: Settings, encoded: dict[tuple[str, ...], int]) -> int:
     """Number of streams of single episodes that no earlier variant has encoded."""
     model, new = experiment["model"], 0
     counts = training_counts(variant, study.task_count, study.train_seeds, study.robot_keys)
     for stream in (name for name in ("rgb", model["action"], model["embodiment"]) if name != "none"):
         for robot, count in counts.items():
-            key = (robot, stream)
+            key = (variant.change, robot, stream)
             new += max(0, count - encoded.get(key, 0))
             encoded[key] = max(count, encoded.get(key, 0))
     return new

@@ -24,7 +24,7 @@ from xew.analysis.studies.config import RECIPE, Run, Settings, Study, build_expe
 from xew.config import merge_settings
 from xew.episode import SCHEMA_VERSION
 from xew.files import file_digest, read_text, write_text
-from xew.protocol import DISTANCE_BODIES, GRADING_PROTOCOL, SHARED_MOTION, Variant
+from xew.protocol import DISTANCE_BODIES, GRADING_PROTOCOL, HEAD, RANDOM_CHANGE, SHARED_MOTION, Variant
 
 TRAININGS = ("train", "adapt")
 """Kinds of steps that keep a GPU busy all the time."""
@@ -36,7 +36,7 @@ class Step:
 
     kind: str
     variant: str
-    """Name of a variant's training (`Run`); empty for a step that serves all."""
+    """Name of a variant's training (`Run`), or of a folder of changed scenes; empty for a step that serves all."""
     command: tuple[str, ...]
     needs: tuple[str, ...]
     inputs: Any
@@ -113,15 +113,17 @@ def plan(study: Study) -> dict[str, Step]:
     """All steps of a study by name, each after those that it needs."""
     experiments = {run.name: build_experiment(study, run) for run in study.planned_runs}
     steps = [_plan_generate(study)]
-    first = f"latents/{study.planned_runs[0].name}"
+    firsts: dict[str, str] = {}
     for variant in study.planned_runs:
         experiment = experiments[variant.name]
+        first = firsts.setdefault(variant.change, f"latents/{variant.name}")
         steps += [
             _plan_latents(study, variant, experiment, first),
             _plan_train(study, variant, experiment),
             _plan_rollout(study, variant, experiment),
             _plan_evaluate(study, variant),
         ]
+    steps += [_plan_changed_scenes(study, change, counts) for change, counts in study.planned_changes.items()]
     for name, (run, change) in study.shifted_runs.items():
         steps += _plan_shift(study, name, run, change, experiments[run.name])
     steps.insert(2, _plan_baselines(study, study.planned_runs[0], experiments[study.planned_runs[0].name]))
@@ -158,21 +160,69 @@ def _rollouts_path(study: Study, variant: str) -> Path:
 
 
 def _plan_generate(study: Study) -> Step:
-    tasks = ("--tasks", *study.tasks) if study.tasks else ()
-    counts = {"train": study.train_seeds, "test": 0} | {study.test_family: study.test_seeds}
-    seeds = tuple(text for family, count in counts.items() for text in (f"--{family}-seeds", str(count)))
+    counts = {"train": study.train_seeds, study.test_family: study.test_seeds}
     motion = () if study.motion == SHARED_MOTION else ("--motion", study.motion)
     robots = dict.fromkeys((study.trained_robots, study.graded_robots))  # once where all are both trained on and graded
     named = tuple(text for option, keys in zip(("--robots", "--test-robots"), robots, strict=False) for text in (option, *keys))
-    asked = (*tasks, *named, *seeds, *motion, *study.generate)
     return Step(
         "generate",
         "",
-        ("xew.sim_warp.generate", "--out", str(study.data_folder), *asked),
+        ("xew.sim_warp.generate", "--out", str(study.data_folder), *_generate_options(study, named, counts)),
         needs=(),
-        inputs=[SCHEMA_VERSION, study.tasks, *robots, study.train_seeds, study.test_seeds, *motion, *_other_family(study)],
+        inputs=[
+            SCHEMA_VERSION,
+            study.tasks,
+            *robots,
+            study.train_seeds,
+            study.test_seeds,
+            *motion,
+            *_other_family(study),
+            *_view_options(study, "--cameras"),
+        ],
         product=study.data_folder,
         every_gpu=True,
+    )
+
+
+def _generate_options(study: Study, robots: Sequence[str], counts: Mapping[str, int]) -> tuple[str, ...]:
+    """Options of `generate` for a study's tasks and motion, with these options for robots and numbers of seeds by family."""
+    tasks = ("--tasks", *study.tasks) if study.tasks else ()
+    asked = {"train": 0, "test": 0} | dict(counts)
+    seeds = (text for family, count in asked.items() for text in (f"--{family}-seeds", str(count)))
+    motion = () if study.motion == SHARED_MOTION else ("--motion", study.motion)
+    return (*tasks, *robots, *seeds, *motion, *_view_options(study, "--cameras"), *study.generate)
+
+
+def _view_options(study: Study, option: str) -> tuple[str, ...]:
+    """The option that names the study's view; none for the head camera, so steps of other studies keep their digests."""
+    return () if study.view == HEAD else (option, study.view)
+
+
+def generate_name(study: Study, change: str) -> str:
+    """Name of the step that makes the scenes with a change, or those without one."""
+    return f"generate/{study.folder_of('data', change).name}" if change else "generate"
+
+
+def _plan_changed_scenes(study: Study, change: str, counts: Mapping[str, int]) -> Step:
+    """Making of scenes with a change, with these numbers of seeds by family, for the training robots.
+
+    Changes of the table's height, which random ones include, need physics; others are rendered from the states of test scenes.
+    """
+    data, robots = study.folder_of("data", change), study.shifted_robots
+    with_physics = change == RANDOM_CHANGE or change.startswith("height")
+    if with_physics:
+        command = ("xew.sim_warp.generate", *_generate_options(study, ("--robots", *robots), counts))
+    else:
+        options = ("--render", "--split", study.test_family, *_view_options(study, "--cameras"))
+        command = ("xew.sim_warp.inspect", str(study.data_folder), *options)
+    return Step(
+        "generate",
+        data.name,
+        (*command, "--change", change, "--out", str(data)),
+        needs=() if with_physics else ("generate",),
+        inputs=[SCHEMA_VERSION, study.tasks, robots, counts, study.motion, study.view],
+        product=data,
+        every_gpu=with_physics,
     )
 
 
@@ -189,9 +239,9 @@ def _plan_latents(study: Study, variant: Variant, experiment: Settings, first: s
         "latents",
         variant.name,
         ("xew.model.latents", str(_config_path(study, variant))),
-        needs=("generate", *started),
+        needs=(generate_name(study, variant.change), *started),
         inputs=_training_inputs(experiment),
-        product=study.out / "latents",
+        product=study.folder_of("latents", variant.change),
         # Streams that variants share are encoded by the first of them that is run.
         after=() if started or first == name else (first,),
         every_gpu=first == name and not started,  # all others wait for it
@@ -239,26 +289,8 @@ def _plan_rollout(study: Study, variant: Variant, experiment: Settings) -> Step:
 
 
 def _plan_shift(study: Study, name: str, run: Run, change: str, experiment: Settings) -> list[Step]:
-    """Making of changed test scenes of a run's training robots, its rollouts on them, and their grading."""
-    data = study.out / f"data_{change.replace(':', '_')}"
-    robots = tuple(robot for robot in run.seen_robots if robot in study.robot_keys)
-    if change.startswith("height"):
-        counts = {"train": 0, "test": 0} | {study.test_family: study.test_seeds}
-        seeds = tuple(text for family, count in counts.items() for text in (f"--{family}-seeds", str(count)))
-        tasks = ("--tasks", *study.tasks) if study.tasks else ()
-        motion = () if study.motion == SHARED_MOTION else ("--motion", study.motion)
-        command = ("xew.sim_warp.generate", *tasks, "--robots", *robots, *seeds, *motion, *study.generate)
-    else:
-        command = ("xew.sim_warp.inspect", str(study.data_folder), "--render", "--split", study.test_family)
-    made = Step(
-        "generate",
-        name,
-        (*command, "--change", change, "--out", str(data)),
-        needs=("generate",),
-        inputs=[change, robots, study.test_seeds, *_other_family(study)],
-        product=data,
-        every_gpu=change.startswith("height"),
-    )
+    """Rollouts of a run on test scenes with a change, and their grading."""
+    data, made = study.folder_of("data", change), generate_name(study, change)
     rollout = _plan_rollout(study, run, experiment)
     out = _rollouts_path(study, name)
     moved = {str(study.data_folder): str(data), str(rollout.product): str(out)}
@@ -266,22 +298,23 @@ def _plan_shift(study: Study, name: str, run: Run, change: str, experiment: Sett
     rolled = replace(
         rollout,
         variant=name,
-        command=tuple(moved.get(text, text) for text in (*asked[0], *robots, *asked[1])),
-        needs=(made.name, _training_name(run)),
+        command=tuple(moved.get(text, text) for text in (*asked[0], *study.shifted_robots, *asked[1])),
+        needs=(made, _training_name(run)),
         inputs=[*rollout.inputs, change],
         product=out,
     )
     scores = study.scores_path(name)
+    options = ("--no-baselines", *_view_options(study, "--view"), *study.evaluate)
     graded = Step(
         "evaluate",
         name,
-        ("xew.metrics.evaluate", str(out), "--data", str(data), "--out", str(scores), "--no-baselines", *study.evaluate),
-        needs=(made.name, rolled.name),
+        ("xew.metrics.evaluate", str(out), "--data", str(data), "--out", str(scores), *options),
+        needs=(made, rolled.name),
         inputs=[study.evaluate, GRADING_PROTOCOL, change],
         product=scores,
         may_spread=True,
     )
-    return [made, rolled, graded]
+    return [rolled, graded]
 
 
 def _plan_baselines(study: Study, variant: Variant, experiment: Settings) -> Step:
@@ -291,13 +324,14 @@ def _plan_baselines(study: Study, variant: Variant, experiment: Settings) -> Ste
     """
     out, frames = study.baselines_path, experiment.get("rollout", {}).get("max_frames", 0)
     given = ("--data", str(study.data_folder), "--out", str(out), "--codec", str(_config_path(study, variant)))
-    asked = ("--baselines-of", study.test_family, "--max-frames", str(frames), *study.evaluate)
+    view = _view_options(study, "--view")
+    asked = ("--baselines-of", study.test_family, "--max-frames", str(frames), *view, *study.evaluate)
     return Step(
         "baselines",
         "",
         ("xew.metrics.evaluate", *given, *asked),
         needs=("generate", f"latents/{variant.name}"),
-        inputs=[frames, study.evaluate, GRADING_PROTOCOL],
+        inputs=[frames, study.evaluate, GRADING_PROTOCOL, *view],
         product=out,
         every_gpu=study.machine.steps_per_gpu > 1,  # alone it would wait for all GPUs to be free, or trainings for it
         may_spread=True,
@@ -308,7 +342,7 @@ def _plan_evaluate(study: Study, variant: Variant) -> Step:
     """Grading of a variant. The truth through a codec is graded once for all variants that share it."""
     out = study.scores_path(variant.name)
     given = ("--data", str(study.data_folder), "--out", str(out))
-    asked = ("--no-baselines", "--codec", str(run_folder(study, variant)), *study.evaluate)
+    asked = ("--no-baselines", "--codec", str(run_folder(study, variant)), *_view_options(study, "--view"), *study.evaluate)
     return Step(
         "evaluate",
         variant.name,

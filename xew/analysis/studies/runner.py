@@ -105,15 +105,15 @@ class StudyRunner:
         if self.budget is not None and not error:
             self.budget.learn(self.ledger)
         if not error and step.kind == "generate":
-            error = self._check_data()
+            error = self._check_data(step.product)
         if error:
             self.failed[name] = error
         self._print_progress(f"{name} {'FAILED: ' + error if error else 'done'} after {format_duration(seconds)}")
         return name
 
-    def _check_data(self) -> str:
-        """What the data set holds beyond the study, or '': its models would be trained and graded on that, too."""
-        study, accepted = self.study, [record for _, record in find_accepted(self.study.data_folder)]
+    def _check_data(self, data: Path) -> str:
+        """What a data set holds beyond the study, or '': its models would be trained and graded on that, too."""
+        study, accepted = self.study, [record for _, record in find_accepted(data)]
         tasks, robots = ({getattr(record, name) for record in accepted} for name in ("task", "robot"))
         beyond = sorted(tasks - set(study.tasks or tasks)) + sorted(robots - set(study.robot_keys))
         for family, wanted in (("train", study.train_seeds), (study.test_family, study.test_seeds)):
@@ -121,7 +121,7 @@ class StudyRunner:
             more = max((len([1 for task, _ in seeds if task == name]) for name in tasks), default=0) - wanted
             beyond += [f"{more} more {family} seeds a task"] if more > 0 else []
         found = ", ".join(beyond)
-        return f"{study.data_folder} also holds {found}; name them in the study, or give it its own data" if found else ""
+        return f"{data} also holds {found}; name them in the study, or give it its own data" if found else ""
 
     def _print_progress(self, text: str) -> None:
         print(f"{time.strftime('%H:%M:%S')} [{self.settled}/{len(self.steps)}] {text}", flush=True)
