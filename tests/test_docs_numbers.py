@@ -48,7 +48,9 @@ def test_sizes_of_the_network(size: str) -> None:
 
 def test_the_recipe() -> None:
     train = load_experiment(FIXED).train
-    row = f"| `configs/fixed.yaml`, {train.steps:,} steps of {train.batch} clips, programs compiled before | 1 H200 | 8 min 7 s |"
+    row = (
+        f"| `configs/fixed.yaml`, {train.steps:,} steps of {train.batch} clips, programs compiled before | 1 H200 | 8 min 7 s |"
+    )
     assert row in page("train_on_many_gpus")
     assert "1,200 steps, with compiling | 1 H100 | 4 min 35 s" in page("train_on_many_gpus")
     assert "1,200 steps in 4 minutes 35 s" in header(FIXED) and "0.16 s a step" in header(FIXED)
@@ -62,8 +64,8 @@ def test_what_the_recipe_reaches() -> None:
     """The header of the config has five metrics on training robots and on bodies."""
     number = r"([\d.]+)"
     said = re.search(
-        rf"training robots LPIPS {number}, PSNR {number} dB, mask IoU {number}, LPIPS of the robot {number}, strict object error "
-        rf"{number} px; four unseen bodies {', '.join([number] * 5)}\.",
+        rf"training robots LPIPS {number}, PSNR {number} dB, mask IoU {number}, LPIPS of the robot {number}, "
+        rf"strict object error {number} px; four unseen bodies {', '.join([number] * 5)}\.",
         header(FIXED),
     )
     assert said is not None
