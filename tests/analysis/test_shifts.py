@@ -63,7 +63,7 @@ def read(tables: tuple[Path, list[Path]]) -> tuple[Scores, list[Scores]]:
 def test_costs_are_paired_over_the_scenes_that_all_have(read: tuple[Scores, list[Scores]]) -> None:
     shifts = Shifts(*read)
     assert shifts.scenes == len(SCENES) - 1 and shifts.changes == ["light:1", "light:3", "height:2"]
-    found = shifts_frame(shifts, "lpips").set_index(["trained_in", "case"])
+    found = shifts_frame(shifts, "lpips").set_index(["trained_with", "case"])
     for (model, share), (case, cost) in product(SHARES.items(), (NEW | COSTS).items()):
         row = found.loc[MODELS[model], case]
         assert row["value"] == pytest.approx(cost if case in NEW else share * cost, abs=1e-6)
@@ -83,8 +83,8 @@ def test_a_model_without_its_own_scores_is_left_out(read: tuple[Scores, list[Sco
 def test_the_table_marks_what_costs_something(read: tuple[Scores, list[Scores]]) -> None:
     table = shifts_table(Shifts(*read))
     rows = {row.labels: row.cells[0] for section in table.sections for row in section.rows}
-    for scenes in ("unchanged scenes", "randomly changed scenes"):
-        own = {new: cell.verdict for (new, trained), cell in rows.items() if trained == scenes}
+    for changes in ("no changes", "random changes"):
+        own = {new: cell.verdict for (new, trained), cell in rows.items() if trained == changes}
         assert list(own.values()) == ["", "worse", "worse", "unresolved", "worse", "worse"]
         assert list(own)[3:] == ["light, level 1", "light, level 3", "height, level 2"]
 

@@ -399,10 +399,10 @@ def test_data_beyond_the_study_is_an_error(study: Study) -> None:
     """Its models would learn from it, and be graded on it."""
     write_synthetic_data(study.data_folder, tasks=("place_empty_cup", "open_laptop"), seeds=(0, 1, 1_000_000), frames=3)
     only = replace(study, robots=("ur5_wsg", "aloha_agilex", "arx_x5", "piper"))
-    said = StudyRunner(only, {}, Ledger(study.out), ThisMachine((), 1, {}), {})._check_data()
+    said = StudyRunner(only, {}, Ledger(study.out), ThisMachine((), 1, {}), {})._check_data(study.data_folder)
     assert "also holds open_laptop, franka_panda, 1 more train seeds a task" in said
     fitting = replace(study, tasks=("place_empty_cup", "open_laptop"), train_seeds=2)
-    assert StudyRunner(fitting, {}, Ledger(study.out), ThisMachine((), 1, {}), {})._check_data() == ""
+    assert StudyRunner(fitting, {}, Ledger(study.out), ThisMachine((), 1, {}), {})._check_data(study.data_folder) == ""
 
 
 def test_a_folder_that_cannot_be_written(tmp_path: Path) -> None:

@@ -18,8 +18,8 @@ from xew.statistics import LEVEL, Mean, combine, noise_floor, strict_metrics, ve
 
 METRICS = ("lpips", "mask_iou", "pck", "trajectory_error")
 """Metrics of the table; a strict metric replaces the paper's."""
-MODELS = {variant.name: f"{'randomly changed' if variant.change else 'unchanged'} scenes" for variant in PARTS["shifts"]}
-"""The variants that are graded on changed scenes, and what each was trained in."""
+MODELS = {variant.name: f"{variant.change or 'no'} changes" for variant in PARTS["shifts"]}
+"""The variants that are graded on changed scenes, and the changes that each was trained with."""
 ROBOTS = PARTS["shifts"][0]
 """The variant whose robots are those of all."""
 SEEN = pooled(ROBOTS, "seen")
@@ -106,20 +106,20 @@ def shifts_table(shifts: Shifts) -> Table:
         "What costs more: a new robot or a new lamp",
         f"One training run of each model on {shifts.scenes} scenes that all rows share. Marks: compared with the same model "
         "where nothing is new, paired by scene. Models have no marks against each other, which would need more training runs.",
-        ("what is new", "trained in"),
+        ("what is new", "trained with"),
         tuple(Column(metric_title(shifts.metrics[metric])) for metric in shown),
         tuple(sections),
     )
 
 
 def shifts_frame(shifts: Shifts, metric: str) -> pd.DataFrame:
-    """Costs by a metric: table trained_in, case, title, value, low, high; NaN if not graded."""
+    """Costs by a metric: table trained_with, case, title, value, low, high; NaN if not graded."""
     rows = []
     for model, (case, title) in product(shifts.models, shifts.cases.items()):
         cost = shifts.cost(model, case, metric)
         ends = (cost.value, *interval_ends(cost, LEVEL)) if cost else (np.nan,) * 3
         rows.append((MODELS[model], case, title, *ends))
-    return pd.DataFrame(rows, columns=["trained_in", "case", "title", "value", "low", "high"])
+    return pd.DataFrame(rows, columns=["trained_with", "case", "title", "value", "low", "high"])
 
 
 def _cell(shifts: Shifts, case: str, model: str, metric: str) -> TableCell:

@@ -108,18 +108,18 @@ def motion_chart(motions: Motions) -> Chart:
 def shifts_chart(shifts: Shifts) -> Chart:
     """Costs in LPIPS of unseen robots and of changed scenes, as bars of each model."""
     data, metric = shifts_frame(shifts, METRIC), shifts.metrics[METRIC]
-    colors = dict(zip(data["trained_in"].unique(), SERIES, strict=False))
+    colors = dict(zip(data["trained_with"].unique(), SERIES, strict=False))
 
     def draw(axes: Axes) -> None:
-        costs = [(color, data.loc[data["trained_in"] == scenes, ["value", "low", "high"]]) for scenes, color in colors.items()]
+        costs = [(color, data.loc[data["trained_with"] == own, ["value", "low", "high"]]) for own, color in colors.items()]
         groups = [(color, values.to_numpy(), np.full(len(values), np.nan)) for color, values in costs]
         charts.bars(axes, list(shifts.cases.values()), groups, metric.title)
 
     caption = (
         "What an unseen robot, and each change of the scene on training robots, adds to the same model's LPIPS on training "
-        "robots in unchanged scenes. Lines: 95 % intervals."
+        "robots in unchanged scenes, by the changes in its training. Lines: 95 % intervals."
     )
-    legend = [Series(f"trained in {scenes}", color) for scenes, color in colors.items()]
+    legend = [Series(changes, color) for changes, color in colors.items()]
     height = PANEL[1] * (0.3 + len(data) / SHIFTS_OF_A_PANEL)
     return Chart("shifts", caption, [Panel(f"Added {metric.title}", draw, height)], data, legend)
 
