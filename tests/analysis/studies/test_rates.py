@@ -102,17 +102,17 @@ def test_training_runs_share_free_gpus_evenly(left: str, gpus: list[int]) -> Non
 @pytest.mark.parametrize(
     ("settings", "machine", "planned", "alone"),
     [
-        ({}, {}, 1, 4),
-        ({"train": {"batch": 8}}, {}, 1, 8),
+        ({}, {}, 1, 8),
+        ({"train": {"batch": 4}}, {}, 1, 4),
         ({"train": {"batch": 8, "accumulate": 2}}, {}, 1, 4),
-        ({"mesh": {"fsdp": 2}}, {}, 2, 4),
+        ({"mesh": {"fsdp": 2}}, {}, 2, 8),
         ({"mesh": {"data": 1, "fsdp": 2}}, {}, 2, 2),
         ({}, {"gpus_per_training": 2}, 2, 2),
         ({}, {"train_launcher": "srun"}, 1, 1),
     ],
 )
 def test_a_run_takes_what_its_mesh_and_batch_allow(settings: Settings, machine: Settings, planned: int, alone: int) -> None:
-    """On eight GPUs, alone; the recipe's batch is four."""
+    """On eight GPUs, alone; the recipe's batch is 16."""
     study = load_study(ROOT / "configs" / "study_small.yaml")
     changed = replace(study, settings=merge_settings(study.settings, settings), machine=replace(study.machine, **machine))
     step = plan(changed)["train/fixed-joints-none"]

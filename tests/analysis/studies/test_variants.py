@@ -21,7 +21,7 @@ CHOSEN = {"split", "model.action", "model.embodiment"}
 STUDIES = {
     "small": {"train.steps", "train.keep_checkpoints"},
     "paper": {"train.keep_checkpoints", "train.samples"},
-    "bodies": {"train.steps", "train.keep_checkpoints", "train.save_every"},
+    "bodies": {"train.steps", "train.keep_checkpoints"},
     "debug": {
         *("clip.frames", "clip.height", "clip.width", "model.size", "train.steps", "train.batch", "train.save_every"),
         *("train.keep_checkpoints", "rollout.steps", "rollout.batch", "rollout.max_frames"),
@@ -32,7 +32,18 @@ SYSTEMS = {"ctrl_world": {"model.history", "model.visibility", "train.history_no
 """Settings that the conditioning of another project's system changes too."""
 ADAPTED = {f"adapt.{name}" for name in ("start_from", "robots", "episodes")} | {
     f"train.{name}"
-    for name in ("optimizer", "steps", "epochs", "learning_rate", "warmup_steps", "decay_to", "ema", "log_every", "save_every")
+    for name in (
+        "batch",
+        "optimizer",
+        "steps",
+        "epochs",
+        "learning_rate",
+        "warmup_steps",
+        "decay_to",
+        "ema",
+        "log_every",
+        "save_every",
+    )
 }
 """Settings that an adaptation changes too."""
 

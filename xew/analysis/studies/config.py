@@ -46,7 +46,7 @@ Settings = dict[str, Any]
 RECIPE: Settings = {
     "clip": {"frames": 33},
     "model": {"size": "small"},
-    "train": {"batch": 4, "steps": 7500, "accumulate": 1},
+    "train": {"batch": 16, "steps": 3000, "accumulate": 1},
     "mesh": {"data": -1, "fsdp": 1},
 }
 """Defaults of xew.model's experiments, which the analysis does not import, as far as costs and devices depend on them."""
