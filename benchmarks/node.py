@@ -237,7 +237,7 @@ class Pipeline:
         return self.args.train_steps * self.batch, "samples"
 
     def _curve(self) -> list[dict[str, float]]:
-        return [json.loads(line) for line in (self.folder / "run" / "metrics.jsonl").read_text().splitlines()]
+        return [json.loads(line) for line in (self.folder / "run" / "metrics.jsonl").read_text(encoding="utf-8").splitlines()]
 
     def _check_rollouts(self) -> tuple[int, str]:
         tested = read_dataset(self.folder / "data").select(robots=None, split="test")
@@ -322,7 +322,8 @@ class Pipeline:
             with stop_on_sigterm():  # the command ends, too
                 return run_sampled(command, log, variables, self.part.cores, self.part.gpus)
         except subprocess.CalledProcessError as error:
-            raise SystemExit(f"{step} ended with {error.returncode}: {log.read_text()[-2000:]}") from error
+            end = log.read_text(encoding="utf-8")[-2000:]
+            raise SystemExit(f"{step} ended with {error.returncode}: {end}") from error
 
     def _tree(self, pattern: str) -> Iterator[Path]:
         for path in self.folder.glob(pattern):

@@ -62,7 +62,7 @@ def cpu_seconds(root: int) -> dict[tuple[int, str], float]:
     found = {}
     for path in Path("/proc").glob("[0-9]*/stat"):
         with contextlib.suppress(OSError):  # it has ended
-            found[int(path.parent.name)] = path.read_text(errors="replace").rpartition(")")[2].split()
+            found[int(path.parent.name)] = path.read_text(encoding="utf-8", errors="replace").rpartition(")")[2].split()
     family, added = set[int](), {root} & found.keys()
     while added:
         family |= added

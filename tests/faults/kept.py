@@ -139,8 +139,8 @@ def cell(folder: Path) -> tuple[Path, Any, Callable[[], Any]]:
 
     def read() -> None:
         if not store.missing(CELL, ["psnr"]) and (grades := store.read(CELL)):
-            _row_table(CELL, grades, ["psnr"])
-            _curve_table(CELL, grades, ["psnr"])
+            _row_table([(CELL, grades)], ["psnr"])
+            _curve_table([(CELL, grades)], ["psnr"])
 
     return store._path(CELL), content, read
 
