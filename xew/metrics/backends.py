@@ -33,7 +33,7 @@ class Masker(Protocol):
     """Robot masks in a predicted video.
 
     The attribute `compares_colors = True` says that the masker compares the two videos: it then gets them in the same exposure
-    and colors (`appearance.match_appearance`). Others get the prediction as it is.
+    and colors (`appearance.TrueAppearance`). Others get the prediction as it is.
     """
 
     def __call__(self, prediction: np.ndarray, target: np.ndarray, target_mask: np.ndarray) -> np.ndarray:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from lab.calibration.predictors import add_grain, expose, flicker, soften
-from xew.metrics.estimators.appearance import REST, TrueAppearance, _describe, match_appearance
+from xew.metrics.estimators.appearance import REST, TrueAppearance, _describe
 
 T, H, W = 14, 120, 160
 rng = np.random.default_rng(3)
@@ -48,7 +48,7 @@ def given(video: np.ndarray) -> np.ndarray:
     ids=["brighter", "darker", "contrast", "tinted", "flicker"],
 )
 def test_exposure_is_evened_out_frame_by_frame(wrong: np.ndarray) -> None:
-    seen, reference = match_appearance(given(wrong), TRUTH, LABELS)
+    seen, reference = TrueAppearance(TRUTH, LABELS).match(given(wrong))
     assert reference is TRUTH
     assert np.abs(seen.astype(int) - TRUTH).mean() < 1.5 < np.abs(given(wrong).astype(int) - TRUTH).mean()
 
@@ -62,7 +62,7 @@ def test_exposure_is_evened_out_frame_by_frame(wrong: np.ndarray) -> None:
 def test_a_body_of_another_color_lends_it_to_the_truth(body: int, change: object) -> None:
     own = body == LABELS
     wrong = given(np.where(own[..., None], change(TRUTH), TRUTH))
-    seen, reference = match_appearance(wrong, TRUTH, LABELS)
+    seen, reference = TrueAppearance(TRUTH, LABELS).match(wrong)
     assert seen is wrong
     assert np.abs(reference[1:].astype(int) - wrong[1:])[own[1:]].mean() < 4
     np.testing.assert_array_equal(reference[~own], TRUTH[~own])
@@ -86,7 +86,7 @@ def test_a_body_of_another_color_lends_it_to_the_truth(body: int, change: object
 def test_other_faults_are_no_appearance(video: np.ndarray) -> None:
     """Above all, what is not there has no color that the truth could take."""
     wrong = np.ascontiguousarray(video)
-    seen, reference = match_appearance(wrong, TRUTH, LABELS)
+    seen, reference = TrueAppearance(TRUTH, LABELS).match(wrong)
     assert seen is wrong and reference is TRUTH
 
 
@@ -116,5 +116,5 @@ def test_percentiles_are_those_of_numpy(count: int) -> None:
 def test_what_predictions_share_leaves_no_trace() -> None:
     shared = TrueAppearance(TRUTH, LABELS)
     for wrong in (flicker(TRUTH), np.where((LABELS == 3)[..., None], 255 - TRUTH, TRUTH), TRUTH, expose(TRUTH, 0.8)):
-        for found, expected in zip(shared.match(wrong), match_appearance(wrong, TRUTH, LABELS), strict=True):
+        for found, expected in zip(shared.match(wrong), TrueAppearance(TRUTH, LABELS).match(wrong), strict=True):
             np.testing.assert_array_equal(found, expected)

@@ -16,7 +16,7 @@ from xew.episode import Record, episode_folder, project, read_record, read_state
 from xew.metrics import METRICS, keypoint_error, mask_iou, perceptual, psnr, ssim
 from xew.metrics.backends import Backend, estimate_masks
 from xew.metrics.episode_cache import EpisodeCache
-from xew.metrics.estimators.appearance import match_appearance
+from xew.metrics.estimators.appearance import TrueAppearance
 from xew.metrics.evaluate import Args, main
 from xew.metrics.grade import Comparison
 from xew.metrics.grade import grade as grade_one
@@ -60,7 +60,7 @@ def test_every_score_is_the_mean_of_the_functions_without_the_given_frame(rollou
         prediction = late(target)
         assert value(scores, "late", robot, "psnr") == pytest.approx(float(np.mean(psnr(prediction[1:], target[1:]))), rel=1e-5)
         assert value(scores, "late", robot, "ssim") == pytest.approx(float(np.mean(ssim(prediction, target)[1:])), rel=1e-5)
-        alike = match_appearance(prediction, target, np.where(mask, 0, -1))
+        alike = TrueAppearance(target, np.where(mask, 0, -1)).match(prediction)
         expected = float(np.mean(mask_iou(estimate_masks(*alike, mask), mask)[1:]))
         assert value(scores, "late", robot, "mask_iou") == pytest.approx(expected, rel=1e-5)
     assert set(scores["frames"]) == {ASKED}
@@ -100,7 +100,7 @@ def test_the_floor_of_a_model_is_the_truth_through_its_codec(
     assert scores.attrs["codecs"] == {"late": [key]} and len(through) == 2 * len(ROBOTS)
     for robot in ROBOTS:
         target, mask = truth(data, robot)[:ASKED], read_states(episode_folder(data, TASK, SEED, robot)).robot_mask[:ASKED]
-        alike = match_appearance(Halved(Path("late"))(target), target, np.where(mask, 0, -1))
+        alike = TrueAppearance(target, np.where(mask, 0, -1)).match(Halved(Path("late"))(target))
         expected = float(np.mean(mask_iou(estimate_masks(*alike, mask), mask)[1:]))
         assert value(scores, CODEC_TRUTH, robot, "mask_iou") == pytest.approx(expected, rel=1e-5)
     summary = summarize_robots(scores)

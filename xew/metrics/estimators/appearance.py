@@ -53,24 +53,12 @@ REST = -1
 """Label of the scene that stands still."""
 
 
-def match_appearance(prediction: np.ndarray, target: np.ndarray, labels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A predicted video with the true exposure, and the true video with the predicted colors of its bodies.
-
-    Args:
-        prediction, target: [t h w 3] uint8 RGB, predicted and true video of one episode, same frames.
-        labels: [t h w] int, the body that a pixel of the target shows, REST for the scene.
-
-    Returns:
-        Both [t h w 3] uint8; the arrays themselves where nothing differs.
-    """
-    return TrueAppearance(target, labels).match(prediction)
-
-
 class TrueAppearance:
     """The appearance of a true video, of which all its predictions share what they are compared with.
 
     Args:
-        target, labels: as in `match_appearance`.
+        target: [t h w 3] uint8 RGB.
+        labels: [t h w] int, the body that a pixel of the target shows, REST for the scene.
     """
 
     def __init__(self, target: np.ndarray, labels: np.ndarray) -> None:
@@ -79,7 +67,10 @@ class TrueAppearance:
         self._looks: dict[tuple[int, bool], _Looks] = {}
 
     def match(self, prediction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """`match_appearance` of a prediction [t h w 3] uint8."""
+        """A prediction [t h w 3] uint8 with the true exposure, and the true video with the predicted colors of its bodies.
+
+        Both are the arrays themselves where nothing differs.
+        """
         prediction = self.even_exposure(prediction)
         return prediction, self.take_colors(prediction)
 
@@ -247,10 +238,10 @@ class _Looks:
         spread = np.std(colors.astype(np.float64), axis=0)
         left = _with_one(self._colors) @ color_map - colors
         is_textured = np.mean(spread**2) > TEXTURE**2 and np.mean(left**2) < UNEXPLAINED * np.mean(spread**2)
-        return color_map if is_textured or _contrast(seen, self._own) > STANDS_OUT * self._contrast else None
+        return color_map if is_textured or _contrast(seen, self._own) > STANDS_OUT * self._true_contrast else None
 
     @cached_property
-    def _contrast(self) -> float:
+    def _true_contrast(self) -> float:
         return _contrast(self._soft, self._own)
 
 
