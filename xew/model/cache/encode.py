@@ -127,8 +127,7 @@ def _open_part(
     encoder: _Encoder, processes: int, gpus: int, results: SimpleQueue, stop: Event
 ) -> Callable[[Sequence[Missing]], object]:
     keep_compiled_programs()
-    if processes != 1:
-        prepare_processes(IMPORTED)  # while this process finds its GPU
+    prepare_processes(IMPORTED)  # while this process finds its GPU
 
     def encode_part(pending: Sequence[Missing]) -> None:
         for size in encoder.encode(pending, count_readers(processes, len(pending), gpus)):

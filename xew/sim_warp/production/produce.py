@@ -98,7 +98,7 @@ Outcome = tuple[list[list[Cell]] | list[Record], float]
 
 
 def make_scenes(
-    workers: Workers, jobs: Sequence[Job], production: Production, wait_for_renderer: Callable[[], object] = list
+    workers: Workers, jobs: Sequence[Job], production: Production, wait_for_renderer: Callable[[], object] = lambda: None
 ) -> Iterator[tuple[list[Record], float]]:
     """Make scenes of different tasks or seeds; yields the headers of a job in the order of its robots, and its time [s].
 

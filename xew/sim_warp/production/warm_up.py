@@ -45,7 +45,7 @@ def compile_on_devices(workers: Workers, devices: Mapping[str, str], batch: int,
     """
     missing = [item for item in devices.items() if not has_kernels(wp.get_device(item[1]), PARTS[item[0]])]
     if not missing:
-        return list
+        return lambda: None
     print(f"Warp compiles its kernels once, into {wp.config.kernel_cache_dir}")
     compile_part = partial(_compile_part, batch=batch)
     going_on = [workers.start(compile_part, item) for item in missing if item[0] == later]
