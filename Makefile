@@ -68,13 +68,15 @@ lint: $(STAMP)
 # Seed -> episodes -> latents -> checkpoint -> rollouts -> scores -> report. Each step skips what is done already. Six scenes, three a
 # task, are the fewest that have intervals; rolled out are the two unseen robots and one of the three that were trained on.
 TASKS ?= place_empty_cup beat_block_hammer
+TRAINED_ON := aloha_agilex arx_x5 ur5_wsg
 ROLLED_OUT ?= ur5_wsg franka_panda piper
 DATA := $(DEMO)/data
 RUN := $(DEMO)/runs/debug
 ROLLOUTS := $(DEMO)/rollouts
 
 demo: $(STAMP)
-	$(BIN)/python -m xew.sim_warp.generate --tasks $(TASKS) --train-seeds 3 --test-seeds 3 --out $(DATA)
+	$(BIN)/python -m xew.sim_warp.generate --tasks $(TASKS) --robots $(TRAINED_ON) --train-seeds 3 --test-seeds 0 --out $(DATA)
+	$(BIN)/python -m xew.sim_warp.generate --tasks $(TASKS) --robots $(ROLLED_OUT) --train-seeds 0 --test-seeds 3 --out $(DATA)
 	$(BIN)/python -m xew.model.latents configs/debug.yaml --data $(DATA)
 	$(BIN)/python -m xew.model.train configs/debug.yaml --data $(DATA) --out $(RUN) --resume
 	$(BIN)/python -m xew.model.rollout $(RUN) --data $(DATA) --split test --robots $(ROLLED_OUT) --out $(ROLLOUTS)

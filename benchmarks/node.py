@@ -86,6 +86,8 @@ class Args:
     robots: tuple[str, ...] = tuple(ROBOTS)
     train_seeds: int = 4
     test_seeds: int = 4
+    generate: str = ""
+    """Further options of `generate`, in one string, as --generate="--manifest tried.json"."""
     train_steps: int = 400
     parts: tuple[PartName, ...] = ("one", "all")
     """one: one GPU with its share of the cores; all: the whole machine."""
@@ -195,7 +197,7 @@ class Pipeline:
         args, steps = self.args, str(self.args.train_steps)
         data, run, rollouts = (str(self.folder / name) for name in ("data", "run", "rollouts"))
         if step == "generate":
-            seeds = ["--train-seeds", str(args.train_seeds), "--test-seeds", str(args.test_seeds)]
+            seeds = ["--train-seeds", str(args.train_seeds), "--test-seeds", str(args.test_seeds), *shlex.split(args.generate)]
             return ["xew.sim_warp.generate", "--tasks", *args.tasks, "--robots", *args.robots, *seeds, "--out", data]
         if step == "latents":
             return ["xew.model.latents", str(args.config), *self._overrides]

@@ -287,6 +287,14 @@ def ray_map(command: Command) -> Video:
     return np.concatenate([streams.ray_map(part.robot_spec, part.action, part.camera) for part in parts], axis=1)
 
 
+def three_shadows(command: Command) -> Video:
+    """The robot's shadows on the bare table under three standard lamps, red, green and blue: [t h w 3] uint8."""
+    from xew.sim_warp.rendering import streams
+
+    parts = command.parts or (command,)
+    return np.concatenate([streams.three_shadows(part.robot_spec, part.action, part.camera) for part in parts], axis=1)
+
+
 def reference_image(command: Command) -> Video:
     """One front view of the robot at home: [1 h w 3] uint8."""
     from xew.sim_warp.rendering import streams
@@ -446,6 +454,14 @@ CONDITIONS: dict[str, Condition | System] = {
         (Condition("carried_render", "map_channels", carried_render, is_guess=True),),
         title="Per-frame render in a scene with carried objects",
         label="per-frame render pasted into the first frame, with carried objects",
+    ),
+    "carried_render_and_shadows": System(
+        (
+            Condition("carried_render", "map_channels", carried_render, is_guess=True),
+            Condition("three_shadows", "shadow_channels", three_shadows),
+        ),
+        title="Per-frame render in a scene with carried objects, and its shadows",
+        label="per-frame render pasted into the first frame, with carried objects, and its shadows",
     ),
 }
 HISTORY = Condition("history", "history", None, title="Earlier frames", label="earlier frames")

@@ -179,6 +179,7 @@ MECHANISMS = {
     "map_channels": Mechanism("channels", "latents", _channels),
     "mask_channels": Mechanism("channels", "latents", _channels),
     "flow_channels": Mechanism("channels", "latents", _channels),
+    "shadow_channels": Mechanism("channels", "latents", _channels),
     "reference_channels": Mechanism("channels", "reference", _channels),
     "ray_channels": Mechanism("channels", "camera", _channels, width=CAMERA),
 }

@@ -22,6 +22,7 @@ from flax import nnx
 from jax import Array
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from xew.concurrency import map_in_order
 from xew.config import pick
 from xew.dataset import Episode
 from xew.episode import Record
@@ -115,13 +116,13 @@ class Predictor:
         records, streams = [record for record, _ in padded], [streams for _, streams in padded]
         text, negative = self._encode_text(records)
         names = self._place(np.array([name_number(record) for record in records], np.uint32))
-        first = self._join(streams, FIRST, np.zeros(1, int))
+        (first,) = self._join(streams, {FIRST: np.zeros(1, int)}).values()
         unaligned, sampling = self._encode_unaligned(streams), self._sampling
         chunks: list[Array] = []
         for number, start in enumerate(range(0, max(frame_count - 1, 1), self.inputs.clip.frames - 1)):
             history = self._encode_history(first, chunks, start)
-            conditions = unaligned | history | self._encode_conditions(streams, start)
-            reference, given = chunks[-1][:, -1:] if chunks else first, self._give_frames(streams, start)
+            aligned, given = self._encode_aligned(streams, start)
+            reference, conditions = chunks[-1][:, -1:] if chunks else first, unaligned | history | aligned
             inputs = ChunkInputs(reference, conditions, text, negative, names, number, given)
             with jax.set_mesh(self._mesh) if self._mesh is not None else nullcontext():
                 chunks.append(predict_chunk(self.graph, self.params, self.codec, inputs, sampling))
@@ -138,22 +139,28 @@ class Predictor:
         conditions = self.inputs.conditions
         return EpisodeReader(conditions, self.inputs.clip, gives_render(self.codec, conditions))
 
-    def _join(self, episodes: Sequence[Streams], name: str, frames: np.ndarray) -> Array:
-        """These frames of a picture stream of every episode [b t h w 3], on the devices; ends of episodes are repeated."""
-        videos = [streams[name] for streams in episodes]
-        joined = np.empty((len(videos), len(frames), *videos[0].shape[1:]), np.uint8)
-        for row, video in zip(joined, videos, strict=True):
-            video.take(frames, axis=0, out=row, mode="clip")
-        return self._place(joined)
+    def _join(self, episodes: Sequence[Streams], frames: Mapping[str, np.ndarray]) -> dict[str, Array]:
+        """These frames of picture streams of every episode, [b t h w 3] on the devices; ends of episodes are repeated.
 
-    def _give_frames(self, episodes: Sequence[Streams], start: int) -> GivenFrames | None:
-        """What the decoder is given of the chunk that begins at frame `start`; as `given_frames`."""
+        A thread a stream copies them: one thread would keep a GPU waiting.
+        """
+
+        def join(name: str) -> Array:
+            videos = [streams[name] for streams in episodes]
+            joined = np.empty((len(videos), len(frames[name]), *videos[0].shape[1:]), np.uint8)
+            for row, video in zip(joined, videos, strict=True):
+                video.take(frames[name], axis=0, out=row, mode="clip")
+            return self._place(joined)
+
+        return dict(zip(frames, map_in_order(join, frames), strict=True))
+
+    def _choose_given(self, episodes: Sequence[Streams], start: int) -> dict[str, np.ndarray]:
+        """Frames that the decoder is given of the chunk that begins at frame `start`, of each stream; as `given_frames`."""
         if RENDER not in episodes[0]:
-            return None
+            return {}
         end = start + self.inputs.clip.frames
         moves = any(len(streams[SCENE]) > 1 for streams in episodes)
-        shown = np.arange(start, end if moves else start + 1)
-        return GivenFrames(self._join(episodes, RENDER, np.arange(start - 1, end + 1)), self._join(episodes, SCENE, shown))
+        return {RENDER: np.arange(start - 1, end + 1), SCENE: np.arange(start, end if moves else start + 1)}
 
     def _encode_text(self, records: Sequence[Record]) -> tuple[Any, Any]:
         """Encode the instructions and, with guidance, as many negative prompts."""
@@ -168,16 +175,14 @@ class Predictor:
 
     def _encode_unaligned(self, episodes: Sequence[Streams]) -> dict[str, Array]:
         """Encode the pictures that every chunk reuses."""
-        return {
-            name: encode_pictures(self.codec, self._join(episodes, name, np.arange(len(episodes[0][name]))))
-            for name, condition in self.inputs.conditions.items()
-            if condition.make is not None and not condition.aligned
-        }
+        names = [name for name, c in self.inputs.conditions.items() if c.make is not None and not c.aligned]
+        joined = self._join(episodes, {name: np.arange(len(episodes[0][name])) for name in names})
+        return {name: encode_pictures(self.codec, pictures) for name, pictures in joined.items()}
 
-    def _encode_conditions(self, episodes: Sequence[Streams], start: int) -> dict[str, Array]:
-        """Encode aligned conditions of the chunk that begins at frame `start`."""
+    def _encode_aligned(self, episodes: Sequence[Streams], start: int) -> tuple[dict[str, Array], GivenFrames | None]:
+        """Encode aligned conditions of the chunk that begins at frame `start`; with what its decoder is given."""
         frames, history = self.inputs.clip.frames, self.inputs.history
-        pictures, numbers = {}, {}
+        pictures, numbers = self._choose_given(episodes, start), {}
         for name, condition in self.inputs.conditions.items():
             if condition.make is None or not condition.aligned:
                 continue
@@ -185,9 +190,12 @@ class Predictor:
                 clips = [clip_numbers(condition, streams[name], start, frames, history) for streams in episodes]
                 numbers[name] = np.stack(clips)
             else:
-                pictures[name] = encode_pictures(self.codec, self._join(episodes, name, np.arange(start, start + frames)))
+                pictures[name] = np.arange(start, start + frames)
+        joined = self._join(episodes, pictures)
+        given = GivenFrames(joined.pop(RENDER), joined.pop(SCENE)) if RENDER in joined else None
+        encoded = {name: encode_pictures(self.codec, frames) for name, frames in joined.items()}
         scaled = apply_scales(self.scales, self.inputs.conditions, numbers)
-        return pictures | {name: self._place(array) for name, array in scaled.items()}
+        return encoded | {name: self._place(array) for name, array in scaled.items()}, given
 
     def _encode_history(self, first: Array, chunks: Sequence[Array], start: int) -> dict[str, Array]:
         """Encode earlier frames of the prediction one by one."""

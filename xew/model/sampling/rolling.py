@@ -22,7 +22,7 @@ from xew.model.sampling.writing import RolloutWriter
 
 Item = tuple[Episode, dict[str, Any]]
 """An episode to predict and the header of its rollout."""
-MOST_READERS = 8
+MOST_READERS = 12
 """Largest number of processes that read for a GPU."""
 
 
@@ -103,7 +103,7 @@ def predict_and_write(
 
 
 def _most_readers() -> int:
-    return min(MOST_READERS, usable_cores() // 2)
+    return min(MOST_READERS, usable_cores() * 3 // 4)
 
 
 def _frames(item: Item) -> int:

@@ -19,6 +19,7 @@ from xew.sim_warp.geometry.poses import matrix_from_pose
 from xew.sim_warp.kinematics.forward import tool_pose
 from xew.sim_warp.rendering.bodies import robot_bodies, robot_pose
 from xew.sim_warp.rendering.render import FLOW_LIMIT, Body, Renderer, World
+from xew.sim_warp.stage import Light, Stage
 
 VIEW_COUNT = 9
 CLIP_FRAMES = 17
@@ -35,6 +36,15 @@ AXIS_LENGTH = 0.1
 """Length of the tool's axes in the ray map [m]."""
 MARKER_RADIUS, AXIS_WIDTH = 50 / 512, 8 / 512
 """Radius of the base marker and width of the axes' lines, as shares of the image's width."""
+THREE_LAMPS = Stage(
+    lights=(
+        Light(1.5, (0.0, 1.0, -1.0), color=(1.0, 0.0, 0.0)),
+        Light(1.5, (-0.866, -0.5, -1.0), color=(0.0, 1.0, 0.0)),
+        Light(1.5, (0.866, -0.5, -1.0), color=(0.0, 0.0, 1.0)),
+    ),
+    ambient=0.1,
+)
+"""A red, a green and a blue lamp round the bare table, 45 degrees high: none of them is a lamp of the scenes."""
 WHITE = np.uint32(0xFFFFFFFF)
 """A white pixel: red, green, blue and an unused byte."""
 RAY_MAP_GROUND: Color = (128, 128, 128)
@@ -95,6 +105,14 @@ def command_renders(
     """Only the renders [t h w 3] uint8 of `command_streams_batch`, of which an episode keeps a video."""
     batch = (renderer or default_renderer()).render_batch(_worlds(commands), camera, ground=False)
     return [frames.rgb for frames in batch]
+
+
+def three_shadows(robot: RobotSpec, action: np.ndarray, camera: Camera = HEAD_CAMERA) -> np.ndarray:
+    """The robot of canonical commands [t 16] on the bare table, with a shadow of each of `THREE_LAMPS`: [t h w 3] uint8.
+
+    The three shadows of a part say where it is above the table, whatever lights the scene.
+    """
+    return default_renderer().render_batch(_worlds([(robot, action)]), camera, stage=THREE_LAMPS)[0].rgb
 
 
 def _worlds(commands: Sequence[tuple[RobotSpec, np.ndarray]]) -> list[World]:
