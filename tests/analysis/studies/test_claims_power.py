@@ -73,9 +73,9 @@ def test_a_dry_run_estimates_from_a_table(
     said = capsys.readouterr().out
     assert "expected of" in said and "r = 0.5" in said and not (tmp_path / "study").exists()
     (tmp_path / "own").mkdir()
-    table.write_bytes((ROOT / "docs" / "results" / "small_fine" / "scores.parquet").read_bytes())
+    table.write_bytes((ROOT / "docs" / "results" / "recipe" / "scores.parquet").read_bytes())
     table.rename(tmp_path / "own" / "scores.parquet")
     main(["configs/study_debug.yaml", "--dry-run", "--out", str(tmp_path / "own")])
     assert "is not of a study" in capsys.readouterr().out, "a study's own scores that tell nothing are no error"
     with pytest.raises(ConfigError, match="is not of a study"):
-        format_power(ROOT / "docs" / "results" / "small_fine" / "scores.parquet")
+        format_power(ROOT / "docs" / "results" / "recipe" / "scores.parquet")
