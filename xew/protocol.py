@@ -344,7 +344,7 @@ MULTI_VIEW = ("optical_flow", "nine_views")
 """Action and appearance conditions of the model from which adaptations start (the paper's appendix on few-shot adaptation)."""
 _FEW_SHOT = tuple(adaptation(target, shots) for target in HELD_OUT_ROBOTS for shots in SHOTS)
 _RENDERED = reference(embodiment="robot_render")
-_RECOMMENDED = reference(action="mask_and_flow_channels", embodiment="carried_render")
+_RECOMMENDED = reference(action="mask_and_flow_channels", embodiment="carried_render_and_shadows")
 
 PARTS: dict[str, tuple[Variant, ...]] = {
     "fixed": (reference(),),

@@ -30,7 +30,7 @@ WAN5B = {
     *("rollout.sampler", "rollout.steps", "rollout.batch", "train.mu_dtype"),
 }
 DEBUG = {
-    *("out", "clip.frames", "model.size", "model.action", "model.history", "model.dtype"),
+    *("out", "clip.frames", "model.size", "model.action", "model.embodiment", "model.history", "model.dtype"),
     *("train.batch", "train.steps", "train.optimizer", "train.mu_dtype", "train.warmup_steps", "train.ema"),
     *("train.motion_loss_weight", "train.log_every", "train.save_every", "train.samples"),
     *("rollout.sampler", "rollout.batch", "rollout.max_frames"),

@@ -34,6 +34,7 @@ from xew.sim_warp.rendering.streams import (
     nine_views,
     ray_map,
     reference_image,
+    three_shadows,
 )
 from xew.sim_warp.robots import ROBOTS, load_urdf
 from xew.sim_warp.scene import scene_rng
@@ -217,6 +218,21 @@ def test_hue_is_direction_and_saturation_is_length() -> None:
     assert abs(colors[5] - colors[2]).max() == 0
     assert abs(colors[4] - [128, 255, 255]).max() < 10
     assert len({tuple(color) for color in colors[:4]}) == 4
+
+
+def test_each_of_three_lamps_throws_a_shadow_on_the_table(robot_key: str) -> None:
+    robot, action = ROBOTS[robot_key], in_view(robot_key)
+    drawn, mask = three_shadows(robot, action), command_streams(robot, action).mask
+    assert drawn.shape == (FRAMES, 240, 320, 3) and drawn.dtype == np.uint8
+    table = drawn[0][~binary_dilation(mask[0], np.ones((3, 3)))].astype(int)
+    lit = np.median(table[table.min(-1) > 150], axis=0)
+    for lamp in range(3):
+        others = np.delete(np.arange(3), lamp)
+        alone = (table[:, lamp] < 0.7 * lit[lamp]) & (table[:, others] > 0.9 * lit[others]).all(-1)
+        assert alone.sum() > 50, lamp
+    changed = action.copy()
+    changed[2:] += 0.3
+    assert np.array_equal(three_shadows(robot, changed)[:2], drawn[:2])
 
 
 def test_ray_map_marks_the_tools(robot_key: str) -> None:

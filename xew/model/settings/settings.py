@@ -26,7 +26,7 @@ class ModelSettings(NetworkSettings):
     """One of MODELS."""
     action: str = "mask_and_flow_channels"
     """Representation of the commanded motion, one of ACTIONS."""
-    embodiment: str = "carried_render"
+    embodiment: str = "carried_render_and_shadows"
     """Representation of the robot's appearance, one of CONDITIONS."""
     reference: Literal["frame", "channels"] = "channels"
     """Input of the clip's first frame: latent frame 0 alone, as in Wan, or the channels of every latent frame too, as in
