@@ -200,9 +200,10 @@ def _swap_objects(planner: Planner, scene: Scene, rng: np.random.Generator, seve
 
 
 def _stop(planner: Planner, scene: Scene, rng: np.random.Generator, severity: float) -> Timeline | None:
-    """Both arms and grippers stop for good, `severity` % of the plan's time before its end."""
+    """Both arms and grippers stop for good, `severity` % of the time before the last move would end."""
     plan = planner(scene)
-    end = (1 - severity / 100) * plan.time
+    last = max((segment.end_time for segments in plan.segments for segment in segments[-1:]), default=plan.time)
+    end = (1 - severity / 100) * last
     for arm in (LEFT, RIGHT):
         begun = [segment for segment in plan.segments[arm] if segment.start_time < end]
         plan = _with_segments(plan, arm, [_cut(segment, end) for segment in begun])
