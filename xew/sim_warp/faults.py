@@ -257,14 +257,14 @@ def _jitter(planner: Planner, scene: Scene, rng: np.random.Generator, severity: 
 
 
 KINDS: tuple[tuple[str, str, Change, tuple[float, ...]], ...] = (
-    ("grasp_offset", "mm", _offset_grasp, (5, 10, 20, 40)),
-    ("close_late", "s", _close_late, (0.3, 0.6, 1.2)),
+    ("grasp_offset", "mm", _offset_grasp, (5, 10, 20, 30, 40)),
+    ("close_late", "s", _close_late, (0.3, 0.45, 0.6)),
     ("stay_open", "", _stay_open, (1,)),
     ("open_early", "%", _open_early, (10, 30, 60)),
-    ("miss_target", "mm", _miss_target, (20, 40, 80)),
+    ("miss_target", "mm", _miss_target, (20, 40, 60)),
     ("swap_objects", "", _swap_objects, (1,)),
     ("low_lift", "%", _lift_low, (50, 80, 95)),
-    ("stop", "%", _stop, (10, 30, 50, 70)),
+    ("stop", "%", _stop, (5, 10, 30, 60)),
     ("push", "mm", _push, (40, 60, 80)),
     ("jitter", "%", _jitter, (10, 20, 40)),
 )
