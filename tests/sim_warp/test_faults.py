@@ -266,5 +266,6 @@ def test_the_summary_counts_outcomes_by_fault() -> None:
     records = [outcome(10_000_000, robot, "stop:10", progress) for robot, progress in (("a", 1.0), ("b", 0.5))]
     records += [outcome(10_000_001, robot, "stop:10", progress) for robot, progress in (("a", 1.0), ("b", None))]
     assert fault_table(records).splitlines()[1].split() == ["stop:10", "2", "1", "2", "50%", "0.75", "plan", "1"]
+    assert fault_table(records).splitlines()[-1] == "commands by scene: 2 in 1"
     assert "tried" not in yield_table(records) and yield_table(records).splitlines()[0] == "motion: shared 4"
     assert describe(records[:2]) == " (stop:10: 1 of 2 succeed)"
