@@ -5,7 +5,6 @@ import pandas as pd
 import pytest
 from scipy import stats
 
-from xew.protocol import join_fault
 from xew.statistics import DRAWS, MIN_SCENES, fixed_mean
 from xew.statistics.bootstrap import Units, bootstrap_means, draw_units, find_strata
 from xew.statistics.correlation import every_draw
@@ -93,13 +92,6 @@ def test_units_are_those_of_the_whole_table() -> None:
     scenes, tasks = Units(rows), Units(rows, "task")
     assert (len(scenes), len(tasks)) == (3, 2) and (scenes.strata, tasks.strata) == ((0, 0, 0), (0, 0))
     assert scenes.numbers(index).tolist() == [2, 1] and tasks.numbers(index).tolist() == [1, 0]
-
-
-def test_faulty_commands_are_drawn_with_their_scene() -> None:
-    seeds = [join_fault(number, base) for base in (0, 1_000_000) for number in (0, 3, 27)]
-    rows = pd.DataFrame({"task": "a", "seed": seeds})
-    index = pd.MultiIndex.from_frame(rows.assign(robot="piper"))
-    assert len(Units(rows)) == 2 and Units(rows).numbers(index).tolist() == [0, 0, 0, 1, 1, 1]
 
 
 def test_draws_are_the_same_at_every_call() -> None:

@@ -1,9 +1,9 @@
 """Bootstrap draws of scenes or tasks, and the mean of scores in every draw.
 
-The unit that is drawn is by default the scene, a (task, base seed), within its task. It is drawn with all its models, robots,
-metrics and faulty commands together, because they share its layout: every mean of one score table sees the same draws, so
-whatever is computed of several means is paired by scene. An interval then says what other scenes of these tasks would give.
-Where tasks are drawn instead, with all their scenes, it says what other tasks would give.
+The unit that is drawn is by default the scene, a (task, seed), within its task. It is drawn with all its models, robots and
+metrics together, because they share its layout: every mean of one score table sees the same draws, so whatever is computed
+of several means is paired by scene. An interval then says what other scenes of these tasks would give. Where tasks are drawn
+instead, with all their scenes, it says what other tasks would give.
 
 Of n units of a stratum (a task), n - 1 are drawn and count n / (n - 1) each, so the variance of a mean over the draws has
 no bias however few they are (Rao and Wu 1988, "Resampling inference with complex survey data").
@@ -15,7 +15,6 @@ from functools import lru_cache
 import numpy as np
 import pandas as pd
 
-from xew.protocol import FAULT_STRIDE
 from xew.statistics.inference import DRAWS, SEED
 from xew.statistics.means import Mean, fixed_mean
 
@@ -35,7 +34,7 @@ class Units:
     def __init__(self, rows: pd.DataFrame, kind: str = "scene") -> None:
         self.kind = kind
         self._names = list(UNITS[kind])
-        self._keys = pd.MultiIndex.from_frame(self._name_units(rows).drop_duplicates().sort_values(self._names))
+        self._keys = pd.MultiIndex.from_frame(rows[self._names].drop_duplicates().sort_values(self._names))
         tasks = self._keys.get_level_values("task").to_list() if kind == "scene" else [""] * len(self._keys)
         self.strata = find_strata(tasks)
 
@@ -44,12 +43,7 @@ class Units:
 
     def numbers(self, index: pd.MultiIndex) -> np.ndarray:
         """[n] int, the number of the unit of each row of a table's index, which has the levels task and seed."""
-        return self._keys.get_indexer(pd.MultiIndex.from_frame(self._name_units(index.to_frame(index=False))))
-
-    def _name_units(self, rows: pd.DataFrame) -> pd.DataFrame:
-        """The columns that name the unit of each row, with the base seed: a scene's faulty commands are drawn with it."""
-        names = rows[self._names]
-        return names.assign(seed=names["seed"] % FAULT_STRIDE) if "seed" in names else names
+        return self._keys.get_indexer(pd.MultiIndex.from_frame(index.to_frame(index=False)[self._names]))
 
 
 def find_strata(tasks: Sequence[str]) -> tuple[int, ...]:
