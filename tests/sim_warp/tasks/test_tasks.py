@@ -16,7 +16,7 @@ from xew.sim_warp.production.outcome import moment
 from xew.sim_warp.robots import ROBOTS
 from xew.sim_warp.scene import Scene, scene_rng
 from xew.sim_warp.tasks import TASKS, get_task
-from xew.sim_warp.tasks.task import Moment
+from xew.sim_warp.tasks.task import Moment, Task, share_of_way
 
 PAGE = Path(__file__).parents[3] / "docs" / "reference" / "tasks.md"
 SOLVERS = dict(zip(sorted(TASKS), cycle(ROBOTS), strict=False))
@@ -42,6 +42,32 @@ def test_an_expert_turns_failure_into_success(name: str, solved: dict[str, Cell]
     assert cell.failure is None
     assert not cell.task.success(cell.scene, at(cell, 0))
     assert cell.task.success(cell.scene, at(cell, -1))
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_progress_goes_from_0_to_1_and_is_1_only_in_success(name: str, solved: dict[str, Cell]) -> None:
+    cell = solved[name]
+    first = at(cell, 0)
+    course = [cell.task.progress(cell.scene, first, at(cell, frame)) for frame in range(cell.path.frame_count)]
+    is_solved = [cell.task.success(cell.scene, at(cell, frame)) for frame in range(cell.path.frame_count)]
+    assert course[0] == pytest.approx(0, abs=0.01) and course[-1] == 1
+    assert [value == 1 for value in course] == is_solved
+    assert min(course) >= 0 and any(0.2 < value < 0.8 for value in course)
+
+
+@pytest.mark.parametrize(
+    ("now", "share"), [((0, 0), 0.0), ((0.1, 0), 0.5), ((0.2, 0.01), 1.0), ((0.3, 0), 1.0), ((-0.5, 0), 0.0), ((0.5, 0), 0.0)]
+)
+def test_the_share_of_the_way_ends_at_the_tolerance(now: tuple[float, float], share: float) -> None:
+    """From 0 to a goal at 0.25 with a tolerance of 0.05 the way is 0.2 long."""
+    assert share_of_way((0.0, 0.0), now, (0.25, 0.0), (0.05, 0.02)) == pytest.approx(share)
+
+
+def test_a_task_without_an_approach_has_progress_0_or_1(solved: dict[str, Cell]) -> None:
+    cell = solved["lift_pot"]
+    plain = Task("lift", "lift", cell.task.sample, cell.task.plan, cell.task.success)
+    first, last = at(cell, 0), at(cell, -1)
+    assert [plain.progress(cell.scene, first, moment) for moment in (first, at(cell, -30), last)] == [0, 0, 1]
 
 
 @pytest.mark.parametrize("name", TASKS)

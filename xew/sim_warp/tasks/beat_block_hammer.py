@@ -14,7 +14,7 @@ from xew.sim_warp.objects import Shape
 from xew.sim_warp.plan import Timeline, tool
 from xew.sim_warp.scene import Scene, SceneObject, draw, upright
 from xew.sim_warp.stage import TABLE_TOP
-from xew.sim_warp.tasks.task import GRASP_TILT, Moment, Task, arm_for, object_axis, pick
+from xew.sim_warp.tasks.task import GRASP_TILT, Moment, Task, arm_for, object_axis, pick, point_above, share_carried
 
 HEAD_SIZE = (0.05, 0.05, 0.07)
 HANDLE_HEIGHT = 0.045
@@ -23,6 +23,8 @@ HANDLE_LENGTH = 0.11
 GRIP_AT = -0.075
 """Place of the grasp along y in the hammer's frame [m]."""
 BLOCK = 0.05
+WITHIN = (0.02, 0.02, 0.006)
+"""Largest offset from the goal in x, y and z [m]."""
 
 
 def hammer() -> Shape:
@@ -66,7 +68,11 @@ def plan(scene: Scene) -> Timeline:
 def success(scene: Scene, now: Moment) -> bool:
     hammer = now.object_pose[scene.index("hammer")]
     offset = np.abs(hammer[:3] - np.array(scene.object("block").pose[:3]) - [0, 0, BLOCK])
-    return bool((offset < [0.02, 0.02, 0.006]).all() and object_axis(hammer, [0, 0, 1])[2] > 0.9)
+    return bool((offset < WITHIN).all() and object_axis(hammer, [0, 0, 1])[2] > 0.9)
 
 
-TASK = Task("beat_block_hammer", "pick up the hammer and hit the {color} block", sample, plan, success)
+def approach(scene: Scene, first: Moment, now: Moment) -> float:
+    return share_carried(scene, first, now, {"hammer": point_above(scene.object("block"), BLOCK)}, WITHIN)
+
+
+TASK = Task("beat_block_hammer", "pick up the hammer and hit the {color} block", sample, plan, success, approach)

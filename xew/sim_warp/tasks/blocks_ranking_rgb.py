@@ -16,7 +16,7 @@ from xew.sim_warp.geometry.poses import Pose
 from xew.sim_warp.plan import Timeline, tool
 from xew.sim_warp.scene import Point, Scene, SceneObject, draw, upright
 from xew.sim_warp.stage import TABLE_TOP
-from xew.sim_warp.tasks.task import STEEP_TILT, Moment, Task, arm_for, pick, place, symmetric_yaw
+from xew.sim_warp.tasks.task import STEEP_TILT, Moment, Task, arm_for, pick, place, share_carried, symmetric_yaw
 
 COLORS = ("red", "green", "blue")
 GRASP_BELOW_TOP = 0.014
@@ -92,6 +92,17 @@ def success(scene: Scene, now: Moment) -> bool:
     return are_in_order(now.object_pose[:, :2]) and now.both_open
 
 
+def approach(scene: Scene, first: Moment, now: Moment) -> float:
+    """The mean share of the blocks' ways to their targets."""
+    goals = {name: (*target, TABLE_TOP) for name, target in scene.targets.items()}
+    return share_carried(scene, first, now, goals, (0.02, 0.02, 0.01))
+
+
 TASK = Task(
-    "blocks_ranking_rgb", "put the red, the green and the blue block in a row from left to right", sample, plan, success
+    "blocks_ranking_rgb",
+    "put the red, the green and the blue block in a row from left to right",
+    sample,
+    plan,
+    success,
+    approach,
 )

@@ -14,7 +14,7 @@ from xew.sim_warp import objects
 from xew.sim_warp.plan import Timeline
 from xew.sim_warp.scene import Scene, upright
 from xew.sim_warp.stage import TABLE_TOP
-from xew.sim_warp.tasks.blocks_ranking_rgb import cube, draw_starts, is_free, move_block, success
+from xew.sim_warp.tasks.blocks_ranking_rgb import approach, cube, draw_starts, is_free, move_block, success
 from xew.sim_warp.tasks.task import Task, opening_for
 
 SIZES = {"large": (0.028, 0.031), "medium": (0.023, 0.026), "small": (0.018, 0.021)}
@@ -59,4 +59,5 @@ TASK = Task(
     sample,
     plan,
     success,
+    approach,
 )

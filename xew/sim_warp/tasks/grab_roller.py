@@ -11,12 +11,13 @@ from xew.sim_warp import objects
 from xew.sim_warp.plan import LEFT, RIGHT, Timeline
 from xew.sim_warp.scene import Scene, SceneObject, upright
 from xew.sim_warp.stage import TABLE_TOP
-from xew.sim_warp.tasks.task import GRIPPER_CLOSED, Moment, Task, across, pick
+from xew.sim_warp.tasks.task import GRIPPER_CLOSED, Moment, Task, across, pick, share_raised
 
 GRASP_FROM_END = 0.03
 GRASP_ABOVE_AXIS = 0.006
 """Height of the tool above the roller's axis [m], for clearance of the lower finger from the table."""
 LIFT = 0.12
+HIGH_ENOUGH = 0.80
 
 
 def sample(rng: np.random.Generator, seed: int) -> Scene:
@@ -48,7 +49,11 @@ def plan(scene: Scene) -> Timeline:
 
 def success(scene: Scene, now: Moment) -> bool:
     index = scene.index("roller")
-    return bool(now.object_pose[index, 2] > 0.80 and (now.gripper < GRIPPER_CLOSED).all())
+    return bool(now.object_pose[index, 2] > HIGH_ENOUGH and (now.gripper < GRIPPER_CLOSED).all())
 
 
-TASK = Task("grab_roller", "use both arms to grab the roller and lift it", sample, plan, success)
+def approach(scene: Scene, first: Moment, now: Moment) -> float:
+    return share_raised(scene, first, now, "roller", HIGH_ENOUGH)
+
+
+TASK = Task("grab_roller", "use both arms to grab the roller and lift it", sample, plan, success, approach)

@@ -11,7 +11,7 @@ from xew.sim_warp.assets import containers
 from xew.sim_warp.plan import LEFT, RIGHT, Timeline, tool
 from xew.sim_warp.scene import Scene, SceneObject, upright
 from xew.sim_warp.stage import TABLE_TOP
-from xew.sim_warp.tasks.task import GRASP_TILT, Moment, Task, object_axis, pick
+from xew.sim_warp.tasks.task import GRASP_TILT, Moment, Task, object_axis, pick, share_raised
 
 WIDEST_TURN = np.radians(22.5)
 LIFT = 0.14
@@ -52,4 +52,8 @@ def success(scene: Scene, now: Moment) -> bool:
     return bool(pose[2] > HIGH_ENOUGH and object_axis(pose, [0, 0, 1])[2] > UPRIGHT and (apart < NEAR).all())
 
 
-TASK = Task("lift_pot", "lift the {color} pot with both arms", sample, plan, success)
+def approach(scene: Scene, first: Moment, now: Moment) -> float:
+    return share_raised(scene, first, now, "pot", HIGH_ENOUGH)
+
+
+TASK = Task("lift_pot", "lift the {color} pot with both arms", sample, plan, success, approach)

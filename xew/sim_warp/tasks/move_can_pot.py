@@ -14,7 +14,7 @@ from xew.sim_warp.assets import containers
 from xew.sim_warp.plan import Timeline
 from xew.sim_warp.scene import Scene, SceneObject, upright
 from xew.sim_warp.stage import TABLE_TOP
-from xew.sim_warp.tasks.task import GRASP_TILT, Moment, Task, arm_for, carry, is_upright, radial_turn, side_sign
+from xew.sim_warp.tasks.task import GRASP_TILT, Moment, Task, arm_for, carry, is_upright, radial_turn, share_carried, side_sign
 
 BESIDE = 0.18
 """Distance of the can from the pot's axis [m]."""
@@ -36,10 +36,15 @@ def sample(rng: np.random.Generator, seed: int) -> Scene:
     )
 
 
+def beside_pot(scene: Scene) -> np.ndarray:
+    """[3] the place of the can on its side of the pot, world [m]."""
+    side = side_sign(arm_for(scene.object("can").pose[0]))
+    return np.array(scene.object("pot").pose[:3]) + [side * BESIDE, 0, 0]
+
+
 def plan(scene: Scene) -> Timeline:
-    can, pot = scene.object("can"), scene.object("pot")
+    can, goal = scene.object("can"), beside_pot(scene)
     arm = arm_for(can.pose[0])
-    goal = np.array(pot.pose[:3]) + [side_sign(arm) * BESIDE, 0, 0]
     timeline = Timeline()
     carry(timeline, can, goal, radial_turn(arm, can.pose, goal), tilt=GRASP_TILT)
     return timeline
@@ -52,4 +57,9 @@ def success(scene: Scene, now: Moment) -> bool:
     return bool(0 < x < 0.2 and abs(y) < 0.035 and abs(z) < 0.005 and is_upright(can, 15) and now.both_open)
 
 
-TASK = Task("move_can_pot", "pick up the {can} can and put it beside the {pot} pot", sample, plan, success)
+def approach(scene: Scene, first: Moment, now: Moment) -> float:
+    goal = beside_pot(scene)
+    return share_carried(scene, first, now, {"can": goal}, (0.02, 0.035, 0.005))
+
+
+TASK = Task("move_can_pot", "pick up the {can} can and put it beside the {pot} pot", sample, plan, success, approach)

@@ -12,10 +12,22 @@ from xew.sim_warp.assets import containers, household
 from xew.sim_warp.plan import Timeline
 from xew.sim_warp.scene import Scene, SceneObject, draw, upright
 from xew.sim_warp.stage import TABLE_TOP
-from xew.sim_warp.tasks.task import GRASP_TILT, Moment, Task, arm_for, carry, is_upright, point_above, radial_turn
+from xew.sim_warp.tasks.task import (
+    GRASP_TILT,
+    Moment,
+    Task,
+    arm_for,
+    carry,
+    is_upright,
+    point_above,
+    radial_turn,
+    share_carried,
+)
 
 PAD = 0.08
 """Side of the pad [m]."""
+WITHIN = (0.03, 0.03, 0.005)
+"""Largest offset from the goal in x, y and z [m]."""
 
 
 def sample(rng: np.random.Generator, seed: int) -> Scene:
@@ -46,7 +58,12 @@ def plan(scene: Scene) -> Timeline:
 def success(scene: Scene, now: Moment) -> bool:
     bottle = now.object_pose[scene.index("bottle")]
     offset = np.abs(bottle[:3] - scene.object("pad").pose[:3] - [0, 0, household.MAT_THICKNESS])
-    return bool((offset < [0.03, 0.03, 0.005]).all() and is_upright(bottle, 15) and now.both_open)
+    return bool((offset < WITHIN).all() and is_upright(bottle, 15) and now.both_open)
 
 
-TASK = Task("move_pillbottle_pad", "place the pill bottle on the {color} pad", sample, plan, success)
+def approach(scene: Scene, first: Moment, now: Moment) -> float:
+    goal = point_above(scene.object("pad"), household.MAT_THICKNESS)
+    return share_carried(scene, first, now, {"bottle": goal}, WITHIN)
+
+
+TASK = Task("move_pillbottle_pad", "place the pill bottle on the {color} pad", sample, plan, success, approach)

@@ -14,9 +14,21 @@ from xew.sim_warp.assets import household
 from xew.sim_warp.plan import Timeline
 from xew.sim_warp.scene import Scene, SceneObject, draw, upright
 from xew.sim_warp.stage import TABLE_TOP
-from xew.sim_warp.tasks.task import STEEP_TILT, Moment, Task, aligning_turn, carry, graspable_yaw, object_axis, point_above
+from xew.sim_warp.tasks.task import (
+    STEEP_TILT,
+    Moment,
+    Task,
+    aligning_turn,
+    carry,
+    graspable_yaw,
+    object_axis,
+    point_above,
+    share_carried,
+)
 
 MAT = (0.11, 0.06)
+WITHIN = (0.02, 0.02, 0.01)
+"""Largest offset from the goal in x, y and z [m]."""
 
 
 def sample(rng: np.random.Generator, seed: int) -> Scene:
@@ -48,7 +60,12 @@ def success(scene: Scene, now: Moment) -> bool:
     pose = now.object_pose[scene.index("stapler")]
     offset = np.abs(pose[:3] - np.array(scene.object("mat").pose[:3]) - [0, 0, household.MAT_THICKNESS])
     along = np.abs(object_axis(pose, [0, 1, 0])[0]) > np.cos(np.radians(10))
-    return bool((offset < [0.02, 0.02, 0.01]).all() and along and now.both_open)
+    return bool((offset < WITHIN).all() and along and now.both_open)
 
 
-TASK = Task("move_stapler_pad", "move the {stapler} to the {color} mat", sample, plan, success)
+def approach(scene: Scene, first: Moment, now: Moment) -> float:
+    goal = point_above(scene.object("mat"), household.MAT_THICKNESS)
+    return share_carried(scene, first, now, {"stapler": goal}, WITHIN)
+
+
+TASK = Task("move_stapler_pad", "move the {stapler} to the {color} mat", sample, plan, success, approach)

@@ -13,7 +13,7 @@ from xew.sim_warp.objects import Shape
 from xew.sim_warp.plan import LEFT, RIGHT, Timeline, Tool, tool
 from xew.sim_warp.scene import Hinge, Scene, SceneObject, upright
 from xew.sim_warp.stage import TABLE_TOP
-from xew.sim_warp.tasks.task import GRASP_TILT, Moment, Task, aside_poses, hinge_of, lid_point, radial_yaw
+from xew.sim_warp.tasks.task import GRASP_TILT, Moment, Task, aside_poses, hinge_of, lid_point, radial_yaw, share_turned
 
 BASE_HEIGHT = 0.016
 LID_THICKNESS = 0.009
@@ -99,4 +99,8 @@ def success(scene: Scene, now: Moment) -> bool:
     return bool(fraction > DONE and near)
 
 
-TASK = Task("open_laptop", "open the laptop with one arm", sample, plan, success)
+def approach(scene: Scene, first: Moment, now: Moment) -> float:
+    return share_turned(scene, first, now, "laptop", DONE)
+
+
+TASK = Task("open_laptop", "open the laptop with one arm", sample, plan, success, approach)

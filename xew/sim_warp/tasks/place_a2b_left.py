@@ -15,7 +15,7 @@ from xew.sim_warp.assets import household
 from xew.sim_warp.assets.household import Thing
 from xew.sim_warp.plan import Timeline
 from xew.sim_warp.scene import Scene, SceneObject, draw
-from xew.sim_warp.tasks.task import Moment, Task, carry, easy_turn, grasp_of, graspable_yaw
+from xew.sim_warp.tasks.task import Moment, Task, carry, easy_turn, grasp_of, graspable_yaw, share_of_way
 
 KINDS = (
     "bell", "bread", "coffee_box", "mouse", "phone", "playing_cards", "rubik_cube", "soap", "stapler", "tea_box", "toy_car",
@@ -111,4 +111,16 @@ def success(scene: Scene, now: Moment) -> bool:
     return is_beside(scene, now, LEFT_OF)
 
 
-TASK = Task("place_a2b_left", "place the {a} to the left of the {b}", sample, plan, success)
+def share_beside(scene: Scene, first: Moment, now: Moment, side: float) -> float:
+    """The share of A's way to the successful distances on the `side` of B."""
+    start, end = (
+        moment.object_pose[scene.index("a"), :2] - moment.object_pose[scene.index("b"), :2] for moment in (first, now)
+    )
+    return share_of_way(start, end, (side * (NEAREST + FARTHEST) / 2, 0.0), ((FARTHEST - NEAREST) / 2, 0.05))
+
+
+def approach(scene: Scene, first: Moment, now: Moment) -> float:
+    return share_beside(scene, first, now, LEFT_OF)
+
+
+TASK = Task("place_a2b_left", "place the {a} to the left of the {b}", sample, plan, success, approach)

@@ -9,7 +9,7 @@ import numpy as np
 
 from xew.sim_warp.plan import Timeline
 from xew.sim_warp.scene import Scene
-from xew.sim_warp.tasks.place_a2b_left import RIGHT_OF, is_beside, plan_beside, sample_beside
+from xew.sim_warp.tasks.place_a2b_left import RIGHT_OF, is_beside, plan_beside, sample_beside, share_beside
 from xew.sim_warp.tasks.task import Moment, Task
 
 
@@ -25,4 +25,8 @@ def success(scene: Scene, now: Moment) -> bool:
     return is_beside(scene, now, RIGHT_OF)
 
 
-TASK = Task("place_a2b_right", "place the {a} to the right of the {b}", sample, plan, success)
+def approach(scene: Scene, first: Moment, now: Moment) -> float:
+    return share_beside(scene, first, now, RIGHT_OF)
+
+
+TASK = Task("place_a2b_right", "place the {a} to the right of the {b}", sample, plan, success, approach)

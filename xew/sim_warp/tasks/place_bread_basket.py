@@ -38,6 +38,8 @@ from xew.sim_warp.tasks.task import (
     opening_for,
     pick,
     place,
+    point_above,
+    share_carried,
 )
 
 BASKET = (0.0, -0.15)
@@ -49,6 +51,8 @@ WALL, FLOOR, RIM = 0.007, 0.007, 0.036
 """Thickness of the walls and of the floor, height of the rim [m]: wide hands pass over it with a bread low in them."""
 SLOT = 0.043
 """Distance from the middle at which each of two breads goes [m]."""
+WITHIN = 0.06
+"""Largest offset of a bread from the basket's middle in x and in y [m]."""
 LIFT = 0.08
 PALM = 0.028
 """Greatest height of a bread above the tool [m]: the shortest fingers reach 39 mm from palm to tool, less the lean."""
@@ -177,9 +181,15 @@ def _put_bread(timeline: Timeline, arm: int, thing: SceneObject, goal: Tool) -> 
 def success(scene: Scene, now: Moment) -> bool:
     for thing in breads(scene):
         offset = now.object_pose[scene.index(thing.name), :3] - scene.object("basket").pose[:3]
-        if (np.abs(offset[:2]) >= 0.06).any() or not 0.0 < offset[2] < RIM:
+        if (np.abs(offset[:2]) >= WITHIN).any() or not 0.0 < offset[2] < RIM:
             return False
     return now.both_open
 
 
-TASK = Task("place_bread_basket", "put the {bread} into the {form} basket", sample, plan, success)
+def approach(scene: Scene, first: Moment, now: Moment) -> float:
+    middle = point_above(scene.object("basket"), RIM / 2)
+    goals = {bread.name: middle for bread in breads(scene)}
+    return share_carried(scene, first, now, goals, (WITHIN, WITHIN, RIM / 2))
+
+
+TASK = Task("place_bread_basket", "put the {bread} into the {form} basket", sample, plan, success, approach)

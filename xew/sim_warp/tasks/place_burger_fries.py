@@ -17,7 +17,18 @@ from xew.sim_warp.objects import Shape
 from xew.sim_warp.plan import LEFT, RIGHT, Timeline, tool
 from xew.sim_warp.scene import Scene, SceneObject, upright
 from xew.sim_warp.stage import TABLE_TOP
-from xew.sim_warp.tasks.task import STEEP_TILT, Moment, Task, aside_poses, pick, place, point_above, radial_turn, radial_yaw
+from xew.sim_warp.tasks.task import (
+    STEEP_TILT,
+    Moment,
+    Task,
+    aside_poses,
+    pick,
+    place,
+    point_above,
+    radial_turn,
+    radial_yaw,
+    share_carried,
+)
 
 TRAY = (0.30, 0.19)
 """Outer size of the tray [m]."""
@@ -160,6 +171,15 @@ def success(scene: Scene, now: Moment) -> bool:
     return now.both_open
 
 
+def approach(scene: Scene, first: Moment, now: Moment) -> float:
+    return share_carried(scene, first, now, spots(scene), (0.08, 0.08, 0.015))
+
+
 TASK = Task(
-    "place_burger_fries", "pick up the burger and the fries with both arms and put them on the tray", sample, plan, success
+    "place_burger_fries",
+    "pick up the burger and the fries with both arms and put them on the tray",
+    sample,
+    plan,
+    success,
+    approach,
 )

@@ -15,10 +15,12 @@ from xew.sim_warp.objects import Shape
 from xew.sim_warp.plan import Timeline
 from xew.sim_warp.scene import Scene, SceneObject, draw, upright
 from xew.sim_warp.stage import TABLE_TOP
-from xew.sim_warp.tasks.task import Moment, Task, carry_by_rim, point_above, vessel_pose
+from xew.sim_warp.tasks.task import Moment, Task, carry_by_rim, point_above, share_carried, vessel_pose
 
 WALL = 0.005
 RIM_DEPTH = 0.007
+WITHIN = (0.05, 0.05, 0.01)
+"""Largest offset from the goal in x, y and z [m]."""
 CLEAR = 0.17
 """Least distance between the centers of container and plate [m]."""
 SLOPE, PLATE_HEIGHT = 0.030, 0.014
@@ -75,7 +77,12 @@ def plan(scene: Scene) -> Timeline:
 
 def success(scene: Scene, now: Moment) -> bool:
     offset = np.abs(now.object_pose[scene.index("container"), :3] - scene.object("plate").pose[:3] - [0, 0, WALL])
-    return bool((offset < [0.05, 0.05, 0.01]).all() and now.both_open)
+    return bool((offset < WITHIN).all() and now.both_open)
 
 
-TASK = Task("place_container_plate", "place the {color} {kind} on the plate", sample, plan, success)
+def approach(scene: Scene, first: Moment, now: Moment) -> float:
+    goal = point_above(scene.object("plate"), WALL)
+    return share_carried(scene, first, now, {"container": goal}, WITHIN)
+
+
+TASK = Task("place_container_plate", "place the {color} {kind} on the plate", sample, plan, success, approach)

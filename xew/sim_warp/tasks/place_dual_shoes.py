@@ -34,6 +34,7 @@ from xew.sim_warp.tasks.task import (
     pick,
     place,
     point_above,
+    share_carried,
     side_sign,
 )
 
@@ -52,6 +53,8 @@ TURNS = np.radians([-12, 75])
 TIP_LEFT = np.pi / 2
 """Yaw at which a shoe's tip, its y axis, points to the left [rad]."""
 SOLE = 0.012
+WITHIN = (0.05, 0.05, 0.015)
+"""Largest offset from the goal in x, y and z [m]."""
 GRASP_HEIGHT = 0.036
 """Height of the tool above the sole's bottom [m]: the pads end above the rim of the sole."""
 GRASP_AT = -0.010
@@ -199,9 +202,15 @@ def success(scene: Scene, now: Moment) -> bool:
     for name, goal in slots(scene).items():
         pose = now.object_pose[scene.index(name)]
         offset = np.abs(pose[:3] - goal)
-        if (offset >= [0.05, 0.05, 0.015]).any() or -object_axis(pose, [0, 1, 0])[0] < np.cos(np.radians(15)):
+        if (offset >= WITHIN).any() or -object_axis(pose, [0, 1, 0])[0] < np.cos(np.radians(15)):
             return False
     return now.both_open
 
 
-TASK = Task("place_dual_shoes", "put the pair of {color} {kind}s into the shoe box, tips to the left", sample, plan, success)
+def approach(scene: Scene, first: Moment, now: Moment) -> float:
+    return share_carried(scene, first, now, slots(scene), WITHIN)
+
+
+TASK = Task(
+    "place_dual_shoes", "put the pair of {color} {kind}s into the shoe box, tips to the left", sample, plan, success, approach
+)

@@ -12,7 +12,7 @@ from xew.sim_warp import objects
 from xew.sim_warp.plan import Timeline
 from xew.sim_warp.scene import Scene, SceneObject, draw, upright
 from xew.sim_warp.stage import TABLE_TOP
-from xew.sim_warp.tasks.task import Moment, Task, carry_by_rim, point_above, vessel_pose
+from xew.sim_warp.tasks.task import Moment, Task, carry_by_rim, point_above, share_carried, vessel_pose
 
 COASTER_HEIGHT = 0.008
 WALL = 0.005
@@ -52,4 +52,9 @@ def success(scene: Scene, now: Moment) -> bool:
     return bool(np.hypot(*offset[:2]) < 0.035 and abs(offset[2]) < 0.015 and now.both_open)
 
 
-TASK = Task("place_empty_cup", "place the empty {color} cup on the coaster", sample, plan, success)
+def approach(scene: Scene, first: Moment, now: Moment) -> float:
+    goal = point_above(scene.object("coaster"), COASTER_HEIGHT)
+    return share_carried(scene, first, now, {"cup": goal}, (0.025, 0.025, 0.015))
+
+
+TASK = Task("place_empty_cup", "place the empty {color} cup on the coaster", sample, plan, success, approach)

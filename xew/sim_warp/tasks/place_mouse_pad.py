@@ -13,9 +13,11 @@ from xew.sim_warp.assets import household
 from xew.sim_warp.plan import Timeline
 from xew.sim_warp.scene import Scene, SceneObject, draw, upright
 from xew.sim_warp.stage import TABLE_TOP
-from xew.sim_warp.tasks.task import Moment, Task, aligning_turn, carry, graspable_yaw, object_axis, point_above
+from xew.sim_warp.tasks.task import Moment, Task, aligning_turn, carry, graspable_yaw, object_axis, point_above, share_carried
 
 MAT = (0.07, 0.13)
+WITHIN = (0.015, 0.012)
+"""Largest offset from the mat's center in x and y [m]."""
 
 
 def sample(rng: np.random.Generator, seed: int) -> Scene:
@@ -48,7 +50,11 @@ def success(scene: Scene, now: Moment) -> bool:
     pose = now.object_pose[scene.index("mouse")]
     offset = np.abs(pose[:2] - scene.object("mat").pose[:2])
     along = np.abs(object_axis(pose, [0, 1, 0])[1]) > np.cos(np.radians(15))
-    return bool((offset < [0.015, 0.012]).all() and along and now.both_open)
+    return bool((offset < WITHIN).all() and along and now.both_open)
 
 
-TASK = Task("place_mouse_pad", "place the {mouse} on the {color} mat", sample, plan, success)
+def approach(scene: Scene, first: Moment, now: Moment) -> float:
+    return share_carried(scene, first, now, {"mouse": scene.object("mat").pose[:2]}, WITHIN)
+
+
+TASK = Task("place_mouse_pad", "place the {mouse} on the {color} mat", sample, plan, success, approach)

@@ -17,7 +17,7 @@ from xew.sim_warp.objects import Shape
 from xew.sim_warp.plan import Timeline
 from xew.sim_warp.scene import Scene, SceneObject, upright
 from xew.sim_warp.stage import TABLE_TOP
-from xew.sim_warp.tasks.task import Moment, Task, carry, draw_pair, easy_turn, graspable_yaw, point_above
+from xew.sim_warp.tasks.task import Moment, Task, carry, draw_pair, easy_turn, graspable_yaw, point_above, share_carried
 
 KINDS = ("mouse", "stapler", "bell")
 GAP = 0.02
@@ -82,4 +82,8 @@ def success(scene: Scene, now: Moment) -> bool:
     return bool(np.hypot(*offset[:2]) < 0.035 and offset[2] > -0.01 and now.both_open)
 
 
-TASK = Task("place_object_scale", "put the {thing} on the {color} scale", sample, plan, success)
+def approach(scene: Scene, first: Moment, now: Moment) -> float:
+    return share_carried(scene, first, now, {"thing": pan_center(scene)}, (0.025, 0.025, 0.01))
+
+
+TASK = Task("place_object_scale", "put the {thing} on the {color} scale", sample, plan, success, approach)

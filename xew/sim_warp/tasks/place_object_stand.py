@@ -18,7 +18,7 @@ from xew.sim_warp.objects import Shape
 from xew.sim_warp.plan import Timeline
 from xew.sim_warp.scene import Scene, SceneObject, upright
 from xew.sim_warp.stage import TABLE_TOP
-from xew.sim_warp.tasks.task import Moment, Task, carry, draw_pair, easy_turn, graspable_yaw, point_above
+from xew.sim_warp.tasks.task import Moment, Task, carry, draw_pair, easy_turn, graspable_yaw, point_above, share_of_way
 
 KINDS = ("bell", "mouse", "remote", "rubik_cube", "stapler", "toy_car")
 COLORS = ("black", "gray", "teal", "purple", "blue", "green")
@@ -27,8 +27,8 @@ PLATE, INLAY = 0.008, 0.002
 STAND_MASS = 0.3
 GAP = 0.01
 """Free space between the two at first [m]."""
-SEATED = 0.01
-"""Largest difference between a thing's height above the table and the stand's [m]."""
+WITHIN = (0.03, 0.03, 0.01)
+"""Largest offset of a thing from the middle of the stand's upper face [m]."""
 
 
 def stand(rng: np.random.Generator) -> tuple[str, Shape]:
@@ -86,7 +86,15 @@ def plan(scene: Scene) -> Timeline:
 def success(scene: Scene, now: Moment) -> bool:
     thing, beneath = (now.object_pose[scene.index(name), :3] for name in ("thing", "stand"))
     offset = np.abs(thing - beneath - [0, 0, top_height(scene)])
-    return bool((offset < [0.03, 0.03, SEATED]).all() and now.both_open)
+    return bool((offset < WITHIN).all() and now.both_open)
 
 
-TASK = Task("place_object_stand", "place the {thing} on the {color} stand", sample, plan, success)
+def approach(scene: Scene, first: Moment, now: Moment) -> float:
+    """The share of the thing's way to the top of the stand, where that is now."""
+    start, end = (
+        moment.object_pose[scene.index("thing"), :3] - moment.object_pose[scene.index("stand"), :3] for moment in (first, now)
+    )
+    return share_of_way(start, end, (0.0, 0.0, top_height(scene)), WITHIN)
+
+
+TASK = Task("place_object_stand", "place the {thing} on the {color} stand", sample, plan, success, approach)

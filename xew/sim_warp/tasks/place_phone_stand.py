@@ -20,7 +20,18 @@ from xew.sim_warp.objects import Shape
 from xew.sim_warp.plan import Timeline, tool
 from xew.sim_warp.scene import Scene, SceneObject, draw, upright
 from xew.sim_warp.stage import TABLE_TOP
-from xew.sim_warp.tasks.task import Moment, Task, arm_for, grasp_of, object_axis, opening_for, pick, place, radial_yaw
+from xew.sim_warp.tasks.task import (
+    Moment,
+    Task,
+    arm_for,
+    grasp_of,
+    object_axis,
+    opening_for,
+    pick,
+    place,
+    radial_yaw,
+    share_of_way,
+)
 
 LEAN = np.radians(40)
 """Lean of the stand's rest from level [rad]."""
@@ -34,6 +45,8 @@ WIDTH = 0.052
 """Width of rest and ledge [m]."""
 LEDGE = 0.022
 """Depth of the ledge [m]."""
+WITHIN = (0.045, 0.04, 0.04)
+"""Largest offset of the phone's lower edge from its place on the ledge [m]."""
 
 
 def stand(style: str, color: Color) -> Shape:
@@ -94,6 +107,12 @@ def _lower_edge(thing: SceneObject) -> np.ndarray:
     return np.array([0.0, thing.shape.hulls[0][:, 1].min(), 0.0])
 
 
+def _edge_place(scene: Scene, now: Moment) -> np.ndarray:
+    """[3] the middle of the phone's lower edge, world."""
+    pose = now.object_pose[scene.index("phone")]
+    return pose[:3] + object_axis(pose, _lower_edge(scene.object("phone")))
+
+
 def ledge(scene: Scene) -> np.ndarray:
     """[3] where that edge comes to rest, world."""
     thing = scene.object("stand")
@@ -116,10 +135,14 @@ def plan(scene: Scene) -> Timeline:
 
 def success(scene: Scene, now: Moment) -> bool:
     pose = now.object_pose[scene.index("phone")]
-    turned = Rotation.from_quat(pose[3:])
-    offset = np.abs(pose[:3] + turned.apply(_lower_edge(scene.object("phone"))) - ledge(scene))
-    lean = np.degrees(np.arccos(np.clip(turned.apply([0, 0, 1])[2], -1, 1)))
-    return bool((offset < [0.045, 0.04, 0.04]).all() and 30 < lean < 50 and now.both_open)
+    offset = np.abs(_edge_place(scene, now) - ledge(scene))
+    lean = np.degrees(np.arccos(np.clip(object_axis(pose, [0, 0, 1])[2], -1, 1)))
+    return bool((offset < WITHIN).all() and 30 < lean < 50 and now.both_open)
 
 
-TASK = Task("place_phone_stand", "put the {phone} on the {color} phone stand", sample, plan, success)
+def approach(scene: Scene, first: Moment, now: Moment) -> float:
+    start, end = (_edge_place(scene, moment) for moment in (first, now))
+    return share_of_way(start, end, ledge(scene), WITHIN)
+
+
+TASK = Task("place_phone_stand", "put the {phone} on the {color} phone stand", sample, plan, success, approach)

@@ -24,6 +24,7 @@ from xew.sim_warp.tasks.task import (
     hinge_of,
     lid_point,
     radial_yaw,
+    share_turned,
 )
 
 PRESS_AT = 0.28
@@ -113,4 +114,8 @@ def success(scene: Scene, now: Moment) -> bool:
     return bool(fraction > DONE and pressing.any())
 
 
-TASK = Task("press_stapler", "press the {stapler}", sample, plan, success)
+def approach(scene: Scene, first: Moment, now: Moment) -> float:
+    return share_turned(scene, first, now, "stapler", DONE)
+
+
+TASK = Task("press_stapler", "press the {stapler}", sample, plan, success, approach)

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from xew.sim_warp.assets import containers
 from xew.sim_warp.plan import Timeline, Tool, tool
 from xew.sim_warp.scene import Scene, SceneObject
-from xew.sim_warp.tasks.task import Moment, Task, arm_for, grasp_across, pick, radial_yaw, side_sign
+from xew.sim_warp.tasks.task import Moment, Task, arm_for, grasp_across, pick, radial_yaw, share_raised, side_sign
 
 WIDEST_TURN = np.radians(45)
 """Largest turn of the bottle from the radial direction [rad]."""
@@ -83,4 +83,8 @@ def success(scene: Scene, now: Moment) -> bool:
     return bool(now.object_pose[scene.index("bottle"), 2] > HIGH_ENOUGH)
 
 
-TASK = Task("shake_bottle", "shake the {color} bottle", sample, plan, success)
+def approach(scene: Scene, first: Moment, now: Moment) -> float:
+    return share_raised(scene, first, now, "bottle", HIGH_ENOUGH)
+
+
+TASK = Task("shake_bottle", "shake the {color} bottle", sample, plan, success, approach)

@@ -14,6 +14,7 @@ from xew.sim_warp.scene import Scene
 from xew.sim_warp.tasks.shake_bottle import (
     STROKE,
     SWING,
+    approach,
     front_pose,
     lying_bottle,
     raise_bottle,
@@ -40,4 +41,4 @@ def plan(scene: Scene) -> Timeline:
     return timeline
 
 
-TASK = Task("shake_bottle_horizontally", "shake the {color} bottle horizontally", sample, plan, success)
+TASK = Task("shake_bottle_horizontally", "shake the {color} bottle horizontally", sample, plan, success, approach)

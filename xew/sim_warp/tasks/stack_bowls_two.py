@@ -13,7 +13,7 @@ from xew.sim_warp import objects
 from xew.sim_warp.plan import Timeline
 from xew.sim_warp.scene import Scene, SceneObject, draw
 from xew.sim_warp.stage import TABLE_TOP
-from xew.sim_warp.tasks.task import Moment, Task, carry_by_rim, vessel_pose
+from xew.sim_warp.tasks.task import Moment, Task, carry_by_rim, share_carried, share_of_way, vessel_pose
 
 STACK = (0.0, -0.1)
 WALL = 0.004
@@ -63,4 +63,12 @@ def success(scene: Scene, now: Moment) -> bool:
     return bool((apart[:2] < 0.04).all() and lower[2] < 0.76 and nested and now.both_open)
 
 
-TASK = Task("stack_bowls_two", "stack the {upper} bowl on the {lower} bowl", sample, plan, success)
+def approach(scene: Scene, first: Moment, now: Moment) -> float:
+    """The mean share of the lower bowl's way to the stack, and of the upper bowl's way into the lower one."""
+    middle = (*STACK, TABLE_TOP)
+    to_stack = share_carried(scene, first, now, {"lower_bowl": middle}, (0.04, 0.04, 0.01))
+    start, end = (moment.object_pose[1, :3] - moment.object_pose[0, :3] for moment in (first, now))
+    return (to_stack + share_of_way(start, end, (0.0, 0.0, NESTING), (0.04, 0.04, 0.012))) / 2
+
+
+TASK = Task("stack_bowls_two", "stack the {upper} bowl on the {lower} bowl", sample, plan, success, approach)

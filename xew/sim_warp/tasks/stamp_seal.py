@@ -18,7 +18,18 @@ from xew.sim_warp.objects import Shape
 from xew.sim_warp.plan import Timeline, tool
 from xew.sim_warp.scene import Scene, SceneObject, draw, upright
 from xew.sim_warp.stage import TABLE_TOP
-from xew.sim_warp.tasks.task import GRASP_TILT, Moment, Task, arm_for, is_upright, pick, place, radial_turn, radial_yaw
+from xew.sim_warp.tasks.task import (
+    GRASP_TILT,
+    Moment,
+    Task,
+    arm_for,
+    is_upright,
+    pick,
+    place,
+    radial_turn,
+    radial_yaw,
+    share_carried,
+)
 
 FACETS = 8
 """Number of flat sides of the knob, for the pads."""
@@ -26,6 +37,8 @@ TURN = 2 * np.pi / FACETS
 GRASP_BELOW_TOP = 0.022
 TARGET = 0.07
 """Edge of the square [m]."""
+WITHIN = (0.01, 0.01, 0.005)
+"""Largest offset from the goal in x, y and z [m]."""
 WOODS: tuple[Color, ...] = ((168, 104, 58), (206, 160, 106), (122, 76, 52))
 BRASS: Color = (205, 165, 75)
 
@@ -90,7 +103,12 @@ def plan(scene: Scene) -> Timeline:
 def success(scene: Scene, now: Moment) -> bool:
     pose = now.object_pose[scene.index("seal")]
     offset = np.abs(pose[:3] - scene.object("square").pose[:3])
-    return bool((offset < [0.01, 0.01, 0.005]).all() and is_upright(pose, 8) and now.both_open)
+    return bool((offset < WITHIN).all() and is_upright(pose, 8) and now.both_open)
 
 
-TASK = Task("stamp_seal", "stamp the seal on the {color} square", sample, plan, success)
+def approach(scene: Scene, first: Moment, now: Moment) -> float:
+    goal = scene.object("square").pose[:3]
+    return share_carried(scene, first, now, {"seal": goal}, WITHIN)
+
+
+TASK = Task("stamp_seal", "stamp the seal on the {color} square", sample, plan, success, approach)

@@ -1,6 +1,6 @@
 """Tasks and their common moves: a task samples a scene, plans its solution and tests success."""
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,6 +32,8 @@ NARROWEST_HAND = 0.08
 GRIPPER_OPEN = 0.8
 """Command beyond which a gripper counts as open (RoboTwin 2.0)."""
 GRIPPER_CLOSED = 0.2
+MOST_UNSOLVED = 0.9
+"""Progress where objects are at their goals, and something else is missing for success, such as an open gripper."""
 
 
 @dataclass(frozen=True)
@@ -68,6 +70,12 @@ class Task:
     """Function scene -> waypoints of both tools, independent of the robot."""
     success: Callable[[Scene, Moment], bool]
     """Function (scene, moment) -> whether the task is solved."""
+    approach: Callable[[Scene, Moment, Moment], float] = lambda scene, first, now: 0.0
+    """Function (scene, first moment, moment) -> share of the objects' way to their goals, 0 to 1."""
+
+    def progress(self, scene: Scene, first: Moment, now: Moment) -> float:
+        """Progress from 0, as at the first moment, to 1, which it is exactly where the task is solved."""
+        return 1.0 if self.success(scene, now) else MOST_UNSOLVED * self.approach(scene, first, now)
 
 
 def point_above(thing: SceneObject, height: float) -> np.ndarray:
@@ -88,6 +96,36 @@ def is_upright(pose: np.ndarray, lean: float) -> bool:
 def arm_for(x: float) -> int:
     """The arm on whose side x [m] lies."""
     return RIGHT if x > 0 else LEFT
+
+
+def share_of_way(start: Point, now: Point, goal: Point, within: Point) -> float:
+    """The share, 0 to 1, of the way [d] m from `start` to the box around `goal` that reaches `within` along each axis."""
+    whole, left = (
+        float(np.linalg.norm(np.maximum(np.abs(np.asarray(point) - np.asarray(goal)) - within, 0))) for point in (start, now)
+    )
+    return max(0.0, 1 - left / whole) if whole else float(not left)
+
+
+def share_carried(scene: Scene, first: Moment, now: Moment, goals: Mapping[str, Point], within: Point) -> float:
+    """The mean `share_of_way` of objects to their goals [d], x y or x y z, world."""
+    shares = []
+    for name, goal in goals.items():
+        start, end = (moment.object_pose[scene.index(name), : len(goal)] for moment in (first, now))
+        shares.append(share_of_way(start, end, goal, within))
+    return float(np.mean(shares))
+
+
+def share_raised(scene: Scene, first: Moment, now: Moment, name: str, height: float) -> float:
+    """The share, 0 to 1, of an object's way up to a height [m], world."""
+    start, end = (moment.object_pose[scene.index(name), 2] for moment in (first, now))
+    return float(np.clip((end - start) / (height - start), 0, 1))
+
+
+def share_turned(scene: Scene, first: Moment, now: Moment, name: str, fraction: float) -> float:
+    """The share, 0 to 1, of the way of an object's hinge to a fraction of its range."""
+    hinge, index = hinge_of(scene.object(name)), scene.index(name)
+    start, end = (hinge.fraction(moment.object_joint[index]) for moment in (first, now))
+    return float(np.clip((end - start) / (fraction - start), 0, 1))
 
 
 def side_sign(arm: int) -> float:
