@@ -1,0 +1,97 @@
+"""Measures of outcomes against values worked out by hand."""
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy.stats import pearsonr, spearmanr
+
+from xew.metrics.outcome.measures import counterfactual_retrieval, outcome_accuracy, progress_error
+from xew.metrics.outcome.ranking import RANKINGS, mean_max_rank_violation, policy_ranking
+
+ONE = np.float32(1)
+NAN = np.float32(np.nan)
+
+
+def test_progress_error_is_the_absolute_difference() -> None:
+    judged, true = np.float32([0.75, 1, 0, NAN]), np.float32([1, 1, 0.5, 1])
+    np.testing.assert_array_equal(progress_error(judged, true), np.float32([0.25, 0, 0.5, NAN]))
+
+
+def test_outcome_accuracy_is_agreement_about_success() -> None:
+    judged, true = np.float32([0.9, 0.9, 0.5, 0.5, NAN]), np.float32([1, 0.9, 1, 0, 1])
+    np.testing.assert_array_equal(outcome_accuracy(judged, true), np.float32([1, 0, 0, 1, NAN]))
+    np.testing.assert_array_equal(outcome_accuracy(judged, true, shown=0.5), np.float32([1, 0, 1, 0, NAN]))
+
+
+@pytest.mark.parametrize(
+    ("distances", "share"),
+    [
+        ([[0, 1], [1, 0]], 1),
+        ([[1, 0], [0, 1]], 0),
+        ([[2, 1, 3], [4, 3, 5], [9, 8, 7]], 2 / 3),  # the first is nearest to the second truth
+        ([[1, 1], [1, 1]], 1 / 2),  # chance: all are equally near
+        ([[0, 0, 1], [5, 0, 5], [1, 1, 1]], (1 / 2 + 1 + 1 / 3) / 3),
+        ([[0, NAN], [1, 0]], NAN),
+    ],
+)
+def test_retrieval_shares_ties(distances: list, share: float) -> None:
+    assert float(counterfactual_retrieval(np.array(distances, np.float32))) == pytest.approx(share, nan_ok=True)
+
+
+@pytest.mark.parametrize("wrong", [np.zeros((2, 3), np.float32), np.zeros((2, 2), int), np.zeros(3, np.float32)])
+def test_retrieval_refuses_other_arrays(wrong: np.ndarray) -> None:
+    with pytest.raises((TypeError, ValueError), match="expected"):
+        counterfactual_retrieval(wrong)
+
+
+@pytest.mark.parametrize("wrong", [np.zeros((2, 2), np.float32), np.zeros(2, int), np.zeros(3, np.float32)])
+def test_progress_of_another_kind_is_refused(wrong: np.ndarray) -> None:
+    with pytest.raises((TypeError, ValueError), match="expected"):
+        progress_error(wrong, np.zeros(2, np.float32) if wrong.ndim == 1 else wrong)
+
+
+@pytest.mark.parametrize(
+    ("judged", "true", "violation"),
+    [
+        ([0.2, 0.5, 0.9], [0.1, 0.4, 0.8], 0),
+        ([0.5, 0.2, 0.9], [0.1, 0.4, 0.8], (0.3 + 0.3 + 0) / 3),  # one neighboring pair is wrong
+        ([0.9, 0.5, 0.2], [0.1, 0.4, 0.8], (0.7 + 0.4 + 0.7) / 3),  # all pairs are
+        ([0.5, 0.5, 0.5], [0.1, 0.4, 0.8], (0.7 + 0.4 + 0) / 3),  # a tie of what differs counts for the lower policy
+        ([0.1, 0.4, 0.8], [0.5, 0.5, 0.5], 0),  # what does not differ cannot be ranked wrongly
+    ],
+)
+def test_mmrv_is_the_worst_wrong_pair_of_each_policy(judged: list, true: list, violation: float) -> None:
+    assert mean_max_rank_violation(np.array(judged), np.array(true)) == pytest.approx(violation)
+
+
+def ranking_rows(scenes: int = 40) -> pd.DataFrame:
+    rng = np.random.default_rng(0)
+    rows = [
+        {
+            "task": f"task{seed % 4}",
+            "seed": seed,
+            "policy": policy,
+            "true": float(rng.random() < rate),
+            "judged": float(rng.random() < rate),
+        }
+        for seed in range(scenes)
+        for policy, rate in enumerate((0.1, 0.4, 0.6, 0.9))
+    ]
+    return pd.DataFrame(rows)
+
+
+def test_policies_are_ranked_by_their_rates_with_intervals_over_scenes() -> None:
+    rows = ranking_rows()
+    ranking = policy_ranking(rows.sample(frac=1, random_state=1))
+    rates = rows.groupby("policy")[["judged", "true"]].mean().to_numpy().T
+    expected = (pearsonr(*rates).statistic, spearmanr(*rates).statistic, mean_max_rank_violation(*rates))
+    assert [mean.value for mean in ranking.values()] == pytest.approx(expected)
+    assert list(ranking) == list(RANKINGS)
+    for mean in ranking.values():
+        low, high = mean.interval()
+        assert low <= mean.value <= high and high > low
+
+
+def test_one_policy_has_no_rank() -> None:
+    with pytest.raises(ValueError, match="1 policies to rank"):
+        policy_ranking(ranking_rows().query("policy == 1"))

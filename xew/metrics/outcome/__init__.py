@@ -1,0 +1,7 @@
+"""Outcomes: what commands cause, as predicted video shows it, against what they cause in the simulator.
+
+measures.py  outcome accuracy, progress error, counterfactual retrieval
+ranking.py   are policies ranked in predicted video as in the simulator
+poses.py     poses of objects from tracked points
+judge.py     what a judge of an episode knows, and progress of estimated poses
+"""
