@@ -37,7 +37,7 @@ GROUND = {"", "statistics", "video"}
 LAZILY = {
     ("model", "sim_warp"): ("conditions", "latents", "cache", "episodes", "devices.parts", "video"),
     ("model", "metrics"): ("codecs.ceiling", "conditions", "training.samples", "weights.reading"),
-    ("metrics", "sim_warp"): ("truth",),
+    ("metrics", "sim_warp"): ("truth", "outcome.judge"),
 }
 """Modules and packages of the first room that may import the second, and inside functions alone: the room loads without it."""
 FORBIDDEN = {

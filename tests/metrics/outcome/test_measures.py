@@ -5,7 +5,13 @@ import pandas as pd
 import pytest
 from scipy.stats import pearsonr, spearmanr
 
-from xew.metrics.outcome.measures import counterfactual_retrieval, outcome_accuracy, progress_error
+from xew.metrics.outcome.measures import (
+    counterfactual_retrieval,
+    hallucinated_success,
+    outcome_accuracy,
+    progress_error,
+    retrieval,
+)
 from xew.metrics.outcome.ranking import RANKINGS, mean_max_rank_violation, policy_ranking
 
 ONE = np.float32(1)
@@ -21,6 +27,17 @@ def test_outcome_accuracy_is_agreement_about_success() -> None:
     judged, true = np.float32([0.9, 0.9, 0.5, 0.5, NAN]), np.float32([1, 0.9, 1, 0, 1])
     np.testing.assert_array_equal(outcome_accuracy(judged, true), np.float32([1, 0, 0, 1, NAN]))
     np.testing.assert_array_equal(outcome_accuracy(judged, true, shown=0.5), np.float32([1, 0, 1, 0, NAN]))
+
+
+def test_hallucinated_success_is_a_share_of_failures() -> None:
+    judged, true = np.float32([0.9, 1, 0.5, 0.1]), np.float32([0.9, 1, 0.5, 0])
+    assert float(hallucinated_success(judged, true)) == pytest.approx(1 / 3)
+    assert np.isnan(hallucinated_success(judged, np.ones_like(true))), "there is no failure"
+
+
+@pytest.mark.parametrize(("distances", "value"), [([3, 1, 2], 1), ([3, 2, 1], 0), ([1, 1, 2], 0.5), ([1, 1, 1], 1 / 3)])
+def test_retrieval_finds_the_own_truth(distances: list, value: float) -> None:
+    assert float(retrieval(np.float32(distances), np.float32([5, 0, 2]))) == pytest.approx(value)
 
 
 @pytest.mark.parametrize(

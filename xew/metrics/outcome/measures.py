@@ -9,14 +9,14 @@ from typing import Any, TypeAlias
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from xew.metrics.metric import AnyArray, ByFrame, Scalar, check_arrays, check_first
 
 Progress: TypeAlias = Float[AnyArray, " t"]
 """Progress in [0, 1] at each moment; NaN where a judge says nothing."""
-Distances: TypeAlias = Float[AnyArray, "k k"]
-"""Distance of each prediction (row) from each truth (column) of a counterfactual set."""
+Distances: TypeAlias = Float[AnyArray, " k"]
+"""Distances from the truths of the k command variants of a scene, a counterfactual set."""
 
 SHOWN = 0.8
 """Judged progress from which on a video shows success, chosen on validation scenes by the rule of docs/metrics.md."""
@@ -65,6 +65,64 @@ def outcome_accuracy(prediction: Progress, target: Progress, shown: float | jax.
     return jnp.where(jnp.isnan(judged + true), jnp.nan, agree)
 
 
+@check_first(check_progress)
+@jax.jit
+def hallucinated_success(prediction: Progress, target: Progress, shown: float | jax.Array = SHOWN) -> Scalar:
+    """Share of the simulator's failures that a video shows as success, in [0, 1]; 0 is best.
+
+    Args:
+        prediction, target, shown: as of `outcome_accuracy`.
+
+    Returns:
+        Scalar float32; NaN where no target is a failure.
+    """
+    values, counts = hallucinated_success_parts(prediction, target, shown)
+    return jnp.sum(jnp.where(counts, values, 0)) / jnp.sum(counts).astype(jnp.float32)
+
+
+@check_first(check_progress)
+@jax.jit
+def hallucinated_success_frames(prediction: Progress, target: Progress) -> ByFrame:
+    """`hallucinated_success` of progress [t] before the mean, [t] float32; NaN where the target is a success."""
+    values, counts = hallucinated_success_parts(prediction, target)
+    return jnp.where(counts, values, jnp.nan)
+
+
+@check_first(check_progress)
+@jax.jit
+def hallucinated_success_parts(
+    prediction: Progress, target: Progress, shown: float | jax.Array = SHOWN
+) -> tuple[ByFrame, Bool[jax.Array, " t"]]:
+    """Values [t] float32 that `hallucinated_success` is the mean of, and [t] bool, which count."""
+    return 1 - outcome_accuracy(prediction, target, shown), ~(jnp.asarray(target, jnp.float32) >= 1)
+
+
+@check_first(check_progress)
+@jax.jit
+def retrieval(prediction: Distances, target: Distances) -> Scalar:
+    """Whether a prediction is nearest to the truth of its own commands: 1, or 1/n if it is equally near to n truths, else 0.
+
+    Args:
+        prediction: [k] distances of the prediction from the truths of k command variants of its scene.
+        target: [k] distances of its own truth from the same truths; the least, 0, says which one is its own.
+
+    Returns:
+        Scalar float32; NaN where a distance is.
+    """
+    value, _ = retrieval_parts(prediction, target)
+    return value
+
+
+@check_first(check_progress)
+@jax.jit
+def retrieval_parts(prediction: Distances, target: Distances) -> tuple[Scalar, Bool[jax.Array, ""]]:
+    """The value that `retrieval` of distances [k] is, scalar float32, and that it counts, scalar bool."""
+    predicted, true = jnp.asarray(prediction, jnp.float32), jnp.asarray(target, jnp.float32)
+    nearest = predicted == jnp.min(predicted)
+    share = jnp.where(nearest[jnp.argmin(true)], 1 / jnp.sum(nearest, dtype=jnp.float32), 0)
+    return jnp.where(jnp.isnan(predicted + true).any(), jnp.nan, share), jnp.bool_(True)
+
+
 def check_distances(distances: Any) -> None:
     """Raise ValueError or TypeError unless distances are floating [k k]."""
     check_arrays(distances=distances)
@@ -76,10 +134,10 @@ def check_distances(distances: Any) -> None:
 
 @check_first(check_distances)
 @jax.jit
-def counterfactual_retrieval(distances: Distances) -> Scalar:
+def counterfactual_retrieval(distances: Float[AnyArray, "k k"]) -> Scalar:
     """Share of predictions that are nearest to the truth of their own commands, higher is better; chance is 1/k.
 
-    A prediction that is equally near to n truths, its own among them, counts 1/n.
+    It is the mean of `retrieval` over a whole counterfactual set.
 
     Args:
         distances: [k k] of prediction i (row) from truth j (column), for k command variants of one scene and robot.
@@ -87,7 +145,5 @@ def counterfactual_retrieval(distances: Distances) -> Scalar:
     Returns:
         Scalar float32; NaN where a distance is.
     """
-    distances = jnp.asarray(distances, jnp.float32)
-    nearest = distances == jnp.min(distances, axis=1, keepdims=True)
-    share = jnp.where(jnp.diagonal(nearest), 1 / jnp.sum(nearest, axis=1, dtype=jnp.float32), 0)
-    return jnp.where(jnp.isnan(distances).any(), jnp.nan, jnp.mean(share))
+    rows = jnp.asarray(distances, jnp.float32)
+    return jnp.mean(jax.vmap(retrieval)(rows, 1 - jnp.eye(len(rows))))

@@ -1,0 +1,210 @@
+"""Poses of objects in a predicted video, from tracked points on their surfaces.
+
+A recursive least-squares fit: in each frame an object is expected where it was, or carried by a hand that holds it, and the
+tracked points correct that. Depth, which few pixels say little of, thus comes from the hand's known path; an object that no hand
+holds can fall, and a lid can only turn about its hinge. An object without any found point stays with what it was with.
+"""
+
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jax.scipy.spatial.transform import Rotation
+from jaxtyping import Bool, Float, Int
+
+from xew.metrics.metric import AnyArray
+
+PIXEL = 1.5
+"""Standard deviation of tracked points [pixels]; their errors on one object are alike, so it is more than a single point's."""
+OUTLIER = 2.0
+"""Number of standard deviations from which on a point's distance counts linearly (Huber)."""
+SLIDE, SLIP = 0.005, 0.003
+"""Standard deviation of an object's motion in a frame [m]: by itself, and in a hand that holds it."""
+TURN = 0.05
+"""Standard deviation of its turn in a frame [rad]."""
+RISE, FALL = 0.002, 0.5
+"""Standard deviation of its vertical motion by itself: at its first height [m], and what a meter over that adds."""
+SWING = 0.1
+"""Standard deviation of the turn of a lid in a frame [rad]."""
+REACH = 0.2
+"""Largest distance [m] between a hand's tool and the origin of an object that it holds."""
+CHANGE = 2.0
+"""Cost of an object's being taken by a hand or released, in squared standard deviations."""
+ITERATIONS = 6
+"""Number of Gauss-Newton steps in a frame."""
+
+Matrix = Float[AnyArray, "4 4"]
+
+
+class Bodies(NamedTuple):
+    """Objects and lids whose poses are estimated."""
+
+    start: Float[AnyArray, "o 4 4"]
+    """Their poses in the first frame, world."""
+    hinged: Bool[AnyArray, " o"]
+    """Whether each is a lid."""
+    anchor: Float[AnyArray, "o 3"]
+    """A point of a lid's axis, world [m]."""
+    axis: Float[AnyArray, "o 3"]
+    """Direction of a lid's axis, world."""
+
+
+class Hands(NamedTuple):
+    """Both hands, whose paths follow from the commands."""
+
+    pose: Float[AnyArray, "t 2 4 4"]
+    """Poses of their tools, world."""
+    closing: Bool[AnyArray, "t 2"]
+    """Whether each is commanded to be less than open."""
+
+
+class Lens(NamedTuple):
+    """The camera that the video is of."""
+
+    intrinsics: Float[AnyArray, "3 3"]
+    extrinsics: Float[AnyArray, "t 4 4"]
+    """World to camera [m]."""
+
+
+@jax.jit
+def follow_bodies(
+    tracks: Float[AnyArray, "t k 2"],
+    local: Float[AnyArray, "k 3"],
+    body: Int[AnyArray, " k"],
+    bodies: Bodies,
+    hands: Hands,
+    lens: Lens,
+) -> Float[jax.Array, "t o 4 4"]:
+    """Poses of bodies in every frame, world.
+
+    Args:
+        tracks: tracked points [pixels], NaN where lost.
+        local: their places in the frames of their bodies [m].
+        body: the number of the body of each, -1 for none.
+        bodies, hands, lens: what is known of them.
+
+    Returns:
+        [t o 4 4] float32.
+    """
+    count = len(bodies.start)
+    own = jnp.asarray(body)[None] == jnp.arange(count)[:, None]
+
+    def step(
+        carry: tuple[jax.Array, jax.Array, jax.Array], now: tuple[jax.Array, ...]
+    ) -> tuple[tuple[jax.Array, ...], jax.Array]:
+        pose, holder, before = carry
+        track, hand, closing, extrinsics = now
+        found = jnp.isfinite(track).all(axis=-1)
+        moved = hand @ jnp.linalg.inv(before)
+        follow = functools.partial(
+            _follow,
+            jnp.nan_to_num(track),
+            local,
+            (moved, before, closing),
+            jnp.asarray(lens.intrinsics, jnp.float32),
+            extrinsics,
+        )
+        pose, holder = jax.vmap(follow)(own & found[None], pose, holder, bodies)
+        return (pose, holder, hand), pose
+
+    start = jnp.asarray(bodies.start, jnp.float32), jnp.full(count, 0), jnp.asarray(hands.pose, jnp.float32)[0]
+    frames = [jnp.asarray(array, jnp.float32) for array in (tracks, hands.pose)]
+    frames += [jnp.asarray(hands.closing), jnp.asarray(lens.extrinsics, jnp.float32)]
+    return lax.scan(step, start, tuple(frames))[1]
+
+
+def _follow(
+    track: jax.Array,
+    local: jax.Array,
+    hands: tuple[jax.Array, jax.Array, jax.Array],
+    intrinsics: jax.Array,
+    extrinsics: jax.Array,
+    found: jax.Array,
+    pose: jax.Array,
+    holder: jax.Array,
+    body: Bodies,
+) -> tuple[jax.Array, jax.Array]:
+    """The pose of one body in a frame and who holds it, 0 for none, from its pose and holder in the frame before."""
+    moved, hand, closing = hands
+    carried = jnp.concatenate([pose[None], moved @ pose])
+    near = jnp.linalg.norm(hand[:, :3, 3] - pose[:3, 3], axis=-1) < REACH
+    possible = jnp.concatenate([jnp.ones(1, bool), closing & near & ~body.hinged])
+    spread = jnp.concatenate([_spread(pose, body)[None], jnp.tile(jnp.diag(_deviations(SLIP, SLIP)), (2, 1, 1))])
+    pivot = jnp.where(body.hinged, body.anchor, jnp.nan)
+    fit = functools.partial(_fit, track, local, found, intrinsics, extrinsics, pivot)
+    poses, costs = jax.vmap(fit)(carried, spread)
+    costs = jnp.where(possible, costs + CHANGE * (jnp.arange(3) != holder), jnp.inf)
+    best = jnp.argmin(costs)
+    return poses[best], best
+
+
+def _deviations(sideways: float | jax.Array, upward: float | jax.Array) -> jax.Array:
+    return jnp.stack([*[jnp.float32(TURN)] * 3, jnp.float32(sideways), jnp.float32(sideways), jnp.float32(upward)])
+
+
+def _spread(pose: jax.Array, body: Bodies) -> jax.Array:
+    """Standard deviations [6 6] of the turn [rad] and motion [m] of a body that no hand holds, of six independent numbers."""
+    height = jnp.maximum(pose[2, 3] - body.start[2, 3], 0)
+    lid = jnp.zeros((6, 6)).at[:3, 0].set(SWING * body.axis)
+    return jnp.where(body.hinged, lid, jnp.diag(_deviations(SLIDE, RISE + FALL * height)))
+
+
+def _fit(
+    track: jax.Array,
+    local: jax.Array,
+    found: jax.Array,
+    intrinsics: jax.Array,
+    extrinsics: jax.Array,
+    anchor: jax.Array,
+    pose: jax.Array,
+    spread: jax.Array,
+) -> tuple[jax.Array, jax.Array]:
+    """The pose near an expected one that fits the found points best, and its cost in squared standard deviations."""
+
+    def residual(pose: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        world = local @ pose[:3, :3].T + pose[:3, 3]
+        seen = world @ extrinsics[:3, :3].T + extrinsics[:3, 3]
+        depth = jnp.maximum(seen[:, 2], 0.05)
+        focal = jnp.diagonal(intrinsics)[:2]
+        pixels = focal * seen[:, :2] / depth[:, None] + intrinsics[:2, 2]
+        of_seen = jnp.concatenate(
+            [jnp.tile(jnp.eye(2), (len(local), 1, 1)), -(seen[:, :2] / depth[:, None])[..., None]], axis=-1
+        )
+        slope = (focal[:, None] * of_seen / depth[:, None, None]) @ extrinsics[:3, :3]
+        return (track - pixels) / PIXEL, slope / PIXEL, world
+
+    def step(state: tuple[jax.Array, jax.Array], _: None) -> tuple[tuple[jax.Array, jax.Array], None]:
+        pose, deviation = state
+        off, slope, world = residual(pose)
+        pivot = _pivot(anchor, pose)
+        turning = jnp.cross(jnp.eye(3)[None], (world - pivot)[:, None])  # [k 3 3], row i: motion by a turn about axis i
+        motion = jnp.concatenate([jnp.swapaxes(turning, 1, 2), jnp.tile(jnp.eye(3), (len(world), 1, 1))], axis=-1)
+        jacobian = slope @ motion @ spread
+        weight = found / jnp.maximum(jnp.linalg.norm(off, axis=-1) / OUTLIER, 1)
+        normal = jnp.einsum("kpi,k,kpj->ij", jacobian, weight, jacobian) + jnp.eye(6)
+        change = jnp.linalg.solve(normal, jnp.einsum("kpi,k,kp->i", jacobian, weight, off) - deviation)
+        return (_moved(pose, pivot, spread @ change), deviation + change), None
+
+    (pose, deviation), _ = lax.scan(step, (pose, jnp.zeros(6)), None, ITERATIONS)
+    far = jnp.linalg.norm(residual(pose)[0], axis=-1)
+    huber = jnp.where(far < OUTLIER, far**2, OUTLIER * (2 * far - OUTLIER))
+    return pose, jnp.sum(jnp.where(found, huber, 0)) + jnp.sum(deviation**2)
+
+
+def _pivot(anchor: jax.Array, pose: jax.Array) -> jax.Array:
+    """The point [3] that a body turns about: its anchor, or, if that is NaN, its origin."""
+    return jnp.where(jnp.isnan(anchor), pose[:3, 3], anchor)
+
+
+def _moved(pose: jax.Array, pivot: jax.Array, twist: jax.Array) -> jax.Array:
+    """A pose [4 4] turned about a pivot [3] and moved by a twist [6], rad and m, world."""
+    turn = _rotation(twist[:3])
+    place = pivot + turn @ (pose[:3, 3] - pivot) + twist[3:]
+    return jnp.eye(4).at[:3, :3].set(turn @ pose[:3, :3]).at[:3, 3].set(place)
+
+
+def _rotation(vector: jax.Array) -> jax.Array:
+    """The rotation [3 3] by a vector [3] rad."""
+    return Rotation.from_rotvec(vector).as_matrix()
