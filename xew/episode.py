@@ -81,7 +81,7 @@ FORMS = {
 """Type and shape of each array of `States`."""
 MOVING_FORMS = FORMS | {"extrinsics": "float64 t 4 4"}
 """The same of a camera that moves."""
-NEW_FIELDS = ("camera", "change")
+NEW_FIELDS = ("camera", "change", "fault", "progress")
 """Fields of a header that are written only if they are not their default: headers without them keep their bytes."""
 
 
@@ -160,6 +160,16 @@ class Record:
     """SHA-256 of the files as they were written, by name. The decoded bytes of such a file need not be compared."""
     camera: CameraSpec = HEAD_SPEC
     """The camera, with the place that it has on this robot."""
+    fault: str = ""
+    """The fault of the commands and its severity, such as grasp_offset:20; empty for the expert. Such an episode is kept
+    whether it is a success or not; it has a failure only if it was refused."""
+    progress: float | None = None
+    """The task's progress at the end, from 0 to 1, of a kept faulty episode."""
+
+    @property
+    def is_kept(self) -> bool:
+        """Whether it is an episode and not a refused cell: an expert's success, or what physics made of a fault."""
+        return self.failure is None if self.fault else self.success
 
 
 def episode_folder(data: Path, task: str, seed: int, robot: str) -> Path:
@@ -333,6 +343,8 @@ def _check_record(record: Record) -> Record:
         raise ValueError(f"its motion is {record.motion!r}, expected {' or '.join(MOTIONS)}")
     if record.change != (change := str(parse_change(record.change) or "")):
         raise ValueError(f"its change is {record.change!r}, expected {change!r}")
+    if record.progress is not None and not 0 <= record.progress <= 1:
+        raise ValueError(f"its progress is {record.progress}, expected a number from 0 to 1")
     if not SLOWEST <= record.frame_rate <= FASTEST or record.frame_count < 0:
         raise ValueError(f"it has {record.frame_count} frames at {record.frame_rate} a second")
     return record

@@ -130,6 +130,8 @@ FINAL_SEED_START = 2_000_000
 them unless it is asked for the family `final`: the scenes of `test` were looked at while recipes were made."""
 SEED_STARTS = {"train": 0, "validation": VALIDATION_SEED_START, "test": TEST_SEED_START, "final": FINAL_SEED_START}
 """First seed of each family."""
+FAULT_STRIDE = 10_000_000
+"""Distance between the seed of an expert's episode and those of its faults 1, 2, ..., all of which have its scene."""
 
 
 def body_key(number: int) -> str:
@@ -401,5 +403,16 @@ def training_counts(
 
 
 def seed_split(seed: int) -> str:
-    """The family that a scene seed belongs to, a key of SEED_STARTS."""
-    return next(family for family, start in reversed(SEED_STARTS.items()) if seed >= start)
+    """The family that a seed belongs to, a key of SEED_STARTS; a faulty episode belongs to that of its scene."""
+    _, base = split_fault(seed)
+    return next(family for family, start in reversed(SEED_STARTS.items()) if base >= start)
+
+
+def split_fault(seed: int) -> tuple[int, int]:
+    """The number of the fault of a seed, 0 for the expert, and the base seed, that of its scene."""
+    return divmod(seed, FAULT_STRIDE)
+
+
+def join_fault(number: int, base: int) -> int:
+    """The seed of the fault `number` in the scene of the seed `base`: the inverse of `split_fault`."""
+    return number * FAULT_STRIDE + base

@@ -107,9 +107,9 @@ def judge_video(video: np.ndarray, truth: Truth, tracker: Tracker) -> Iterator[R
     """frame true judged: progress in frames of a video [t h w 3] uint8, and of the truth."""
     outcome, frames = truth.outcome, instants(len(video))
     assert outcome is not None
-    judged = Comparison(video, EpisodeCache(truth), open_masker("opencv"), tracker).judge(frames)
-    for frame, progress in zip(frames, judged, strict=True):
-        yield {"frame": frame, "true": outcome.true_progress(frame), "judged": progress}
+    poses = Comparison(video, EpisodeCache(truth), open_masker("opencv"), tracker).judged_poses
+    for frame in frames:
+        yield {"frame": frame, "true": outcome.true_progress(frame), "judged": outcome.progress(poses[frame], frame)}
 
 
 def report(rows: pd.DataFrame) -> str:

@@ -38,7 +38,6 @@ from xew.metrics.outcome.measures import (
     retrieval,
     retrieval_parts,
 )
-from xew.metrics.outcome.ranking import mean_max_rank_violation, policy_ranking
 from xew.metrics.perceptual import (
     lpips,
     lpips_embedding,
@@ -69,6 +68,7 @@ from xew.metrics.track import (
     trajectory_error_strict,
     warpings,
 )
+from xew.statistics import mean_max_rank_violation, policy_ranking
 
 INF = math.inf
 PAPER, STRICT = ("paper",), ("strict",)

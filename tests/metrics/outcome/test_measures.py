@@ -1,9 +1,7 @@
 """Measures of outcomes against values worked out by hand."""
 
 import numpy as np
-import pandas as pd
 import pytest
-from scipy.stats import pearsonr, spearmanr
 
 from xew.metrics.outcome.measures import (
     counterfactual_retrieval,
@@ -12,9 +10,7 @@ from xew.metrics.outcome.measures import (
     progress_error,
     retrieval,
 )
-from xew.metrics.outcome.ranking import RANKINGS, mean_max_rank_violation, policy_ranking
 
-ONE = np.float32(1)
 NAN = np.float32(np.nan)
 
 
@@ -65,50 +61,3 @@ def test_retrieval_refuses_other_arrays(wrong: np.ndarray) -> None:
 def test_progress_of_another_kind_is_refused(wrong: np.ndarray) -> None:
     with pytest.raises((TypeError, ValueError), match="expected"):
         progress_error(wrong, np.zeros(2, np.float32) if wrong.ndim == 1 else wrong)
-
-
-@pytest.mark.parametrize(
-    ("judged", "true", "violation"),
-    [
-        ([0.2, 0.5, 0.9], [0.1, 0.4, 0.8], 0),
-        ([0.5, 0.2, 0.9], [0.1, 0.4, 0.8], (0.3 + 0.3 + 0) / 3),  # one neighboring pair is wrong
-        ([0.9, 0.5, 0.2], [0.1, 0.4, 0.8], (0.7 + 0.4 + 0.7) / 3),  # all pairs are
-        ([0.5, 0.5, 0.5], [0.1, 0.4, 0.8], (0.7 + 0.4 + 0) / 3),  # a tie of what differs counts for the lower policy
-        ([0.1, 0.4, 0.8], [0.5, 0.5, 0.5], 0),  # what does not differ cannot be ranked wrongly
-    ],
-)
-def test_mmrv_is_the_worst_wrong_pair_of_each_policy(judged: list, true: list, violation: float) -> None:
-    assert mean_max_rank_violation(np.array(judged), np.array(true)) == pytest.approx(violation)
-
-
-def ranking_rows(scenes: int = 40) -> pd.DataFrame:
-    rng = np.random.default_rng(0)
-    rows = [
-        {
-            "task": f"task{seed % 4}",
-            "seed": seed,
-            "policy": policy,
-            "true": float(rng.random() < rate),
-            "judged": float(rng.random() < rate),
-        }
-        for seed in range(scenes)
-        for policy, rate in enumerate((0.1, 0.4, 0.6, 0.9))
-    ]
-    return pd.DataFrame(rows)
-
-
-def test_policies_are_ranked_by_their_rates_with_intervals_over_scenes() -> None:
-    rows = ranking_rows()
-    ranking = policy_ranking(rows.sample(frac=1, random_state=1))
-    rates = rows.groupby("policy")[["judged", "true"]].mean().to_numpy().T
-    expected = (pearsonr(*rates).statistic, spearmanr(*rates).statistic, mean_max_rank_violation(*rates))
-    assert [mean.value for mean in ranking.values()] == pytest.approx(expected)
-    assert list(ranking) == list(RANKINGS)
-    for mean in ranking.values():
-        low, high = mean.interval()
-        assert low <= mean.value <= high and high > low
-
-
-def test_one_policy_has_no_rank() -> None:
-    with pytest.raises(ValueError, match="1 policies to rank"):
-        policy_ranking(ranking_rows().query("policy == 1"))

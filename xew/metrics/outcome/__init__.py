@@ -4,4 +4,6 @@ measures.py  outcome accuracy, progress error, counterfactual retrieval
 ranking.py   are policies ranked in predicted video as in the simulator
 poses.py     poses of objects from tracked points
 judge.py     what a judge of an episode knows, and progress of estimated poses
+
+Policy ranking rests on rates alone: `xew.statistics.ranking`.
 """

@@ -14,7 +14,7 @@ import jax
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from xew.episode import Record, States, episode_folder, data_folder, read_record, read_states
+from xew.episode import Record, States, data_folder, episode_folder, read_record, read_states
 from xew.metrics.metric import fill_up
 from xew.metrics.outcome.poses import REACH, Bodies, Hands, Lens, follow_bodies
 from xew.protocol import ARMS, split_fault

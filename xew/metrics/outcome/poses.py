@@ -1,8 +1,8 @@
 """Poses of objects in a predicted video, from tracked points on their surfaces.
 
-A recursive least-squares fit: in each frame an object is expected where it was, or carried by a hand that holds it, and the
-tracked points correct that. Depth, which few pixels say little of, thus comes from the hand's known path; an object that no hand
-holds can fall, and a lid can only turn about its hinge. An object without any found point stays with what it was with.
+A recursive least-squares fit: in each frame an object is expected where it was, or where a hand that holds it carries it, and
+the tracked points correct that. Pixels say little of depth, so it comes from the hand's known path. An object that no hand holds
+can slide and fall, and a lid can only turn about its hinge. An object of which no point is found stays as it was, or in its hand.
 """
 
 import functools

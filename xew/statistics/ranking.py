@@ -4,14 +4,17 @@ Agreement is measured by Pearson's r, Spearman's rank correlation, and the mean 
 "Evaluating real-world robot manipulation policies in simulation", 2024, arXiv 2405.05941). Intervals are over scenes.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from scipy.stats import rankdata
 
-from xew.statistics import Mean, bootstrap_means, combine, pearson
-from xew.statistics.bootstrap import Units
+from xew.protocol import split_fault
+from xew.statistics.bootstrap import Units, bootstrap_means
+from xew.statistics.correlation import pearson
+from xew.statistics.means import Mean, combine
 
 
 def spearman(judged: np.ndarray, true: np.ndarray) -> np.ndarray:
@@ -47,6 +50,7 @@ RANKINGS: dict[str, Callable[[np.ndarray, np.ndarray], np.ndarray]] = {
     "mmrv": mean_max_rank_violation,
 }
 """Functions of judged and true success rates [... p] by name."""
+RANKED = ["robot", "model", "condition", "measure", "value", "low", "high", "policies", "scenes"]
 BOUNDS = {"pearson": (-1.0, 1.0), "spearman": (-1.0, 1.0), "mmrv": (0.0, 1.0)}
 
 
@@ -71,3 +75,28 @@ def policy_ranking(rows: pd.DataFrame) -> dict[str, Mean]:
         return lambda *values: function(*np.split(np.stack(values, axis=-1), 2, axis=-1))
 
     return {name: combine(compare(function), *known).within(BOUNDS[name]) for name, function in RANKINGS.items()}
+
+
+def rank_policies(rows: pd.DataFrame, groups: Mapping[str, Sequence[str]]) -> pd.DataFrame:
+    """How models rank policies: the expert and its faults, each a policy with a success rate over scenes.
+
+    Args:
+        rows: of a score table, with the metrics outcome_accuracy and hallucinated_success (which failures alone have).
+        groups: robots that are pooled, by the name of the group.
+
+    Returns:
+        robot model condition measure value low high policies scenes; empty where the table has no two policies.
+    """
+    key = ["model", "condition", "task", "seed", "robot"]
+    graded = rows[rows["metric"] == "outcome_accuracy"].set_index(key)["value"]
+    failed = graded.index.isin(pd.MultiIndex.from_frame(rows.loc[rows["metric"] == "hallucinated_success", key]))
+    episodes = pd.DataFrame({"true": (~failed).astype(float), "judged": (failed ^ (graded == 1)).astype(float)}).reset_index()
+    episodes["policy"], episodes["seed"] = split_fault(episodes["seed"].to_numpy())
+    table: list[tuple[Any, ...]] = []
+    for group, robots in groups.items():
+        for (model, condition), own in episodes[episodes["robot"].isin(robots)].groupby(["model", "condition"], sort=False):
+            if own["policy"].nunique() > 1:
+                counts = own["policy"].nunique(), len(own[["task", "seed"]].drop_duplicates())
+                ranking = policy_ranking(own).items()
+                table += [(group, model, condition, name, mean.value, *mean.interval(), *counts) for name, mean in ranking]
+    return pd.DataFrame(table, columns=RANKED)
