@@ -16,7 +16,7 @@ def select_unpaired(dataset: Dataset, robots: Collection[str], seeds: Seeds) -> 
     return [
         (folder, record)
         for folder, record in dataset.cells
-        if record.success and record.videos and record.robot in robots and seed_split(record.seed) == seeds
+        if record.is_kept and record.videos and record.robot in robots and seed_split(record.seed) == seeds
     ]
 
 

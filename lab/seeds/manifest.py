@@ -27,7 +27,7 @@ def manifest_of(records: Collection[Record]) -> Manifest:
     """What the headers of a data set know of its seeds; seeds that some robot has not tried are left out."""
     robots = sorted({record.robot for record in records})
     cells: dict[str, dict[int, dict[str, Record]]] = defaultdict(lambda: defaultdict(dict))
-    for record in records:
+    for record in (record for record in records if not record.fault):
         cells[record.task][record.seed][record.robot] = record
     return Manifest(
         tuple(robots),

@@ -233,7 +233,7 @@ def _make_tables(
 
 def _count_expected(records: Sequence[Record], robots: Sequence[str], families: Collection[str]) -> int:
     """Episodes of these robots and families of seeds, in seeds that all robots have mastered: what a complete table has."""
-    failed = {(record.task, record.seed) for record in records if not record.success}
+    failed = {(record.task, record.seed) for record in records if not record.is_kept}
     graded = [record for record in records if record.robot in robots and seed_split(record.seed) in families]
     return sum((record.task, record.seed) not in failed for record in graded)
 

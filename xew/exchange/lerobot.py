@@ -7,7 +7,7 @@ Writes DIR: meta/ (info, tasks, episodes, statistics), data/ (parquet, many epis
     observation.tool_pose         14 numbers: left and right tool, x y z [m] and quaternion x y z w, world
     observation.images.head       the head camera; observation.images.robot with --robot-video: the robot alone by its commands
     observation.images.cam_…      with --views, one video a camera by RoboTwin's names (CAMERA_NAMES)
-    next.done, next.success       true at the last frame
+    next.done, next.success       true at the last frame; next.success only if the task is solved
 The table of episodes has each episode's robot, task, seed and kind of motion (columns xew/…), and in changed scenes xew/change.
 A feature that an imported episode lacks is omitted for the whole set. `fps` is the episodes' frame rate, 50 / 3 in simulated
 data; a set has one rate. Video is lossy; all other data are exact.
@@ -155,6 +155,7 @@ def _write(root: Path, chosen: Sequence[tuple[Path, Record]], vectors: Vectors, 
         start = 0
         for number, (folder, record) in enumerate(tqdm(chosen, desc="exporting", unit="episode")):
             columns = _columns(read_states(folder, record), vectors, rate, number, start, tasks[instructions[number]])
+            columns["next.success"] = columns["next.done"] & record.success
             place = table.add(columns)
             row: dict[str, Any] = {"episode_index": number, "tasks": [instructions[number]], "length": len(columns["index"])}
             row |= {"data/chunk_index": place.chunk, "data/file_index": place.file}

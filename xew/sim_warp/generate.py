@@ -5,6 +5,7 @@ Writes <out>/<task>/<seed>/<robot>/, see xew/episode.py; one line per task and r
 
 Seeds are tried in order until enough are accepted: a seed is accepted if all robots succeed on it. Seeds that fail according to
 the manifest (manifest.py) are skipped. Episodes on disk are not made again: an interrupted command can be run again.
+--faults 8 adds seven faulty episodes to each accepted scene, with commands that may fail, and keeps failures too.
 
 Command: python -m xew.sim_warp.generate --batch 256 [--tasks … --robots … --train-seeds 50 --test-seeds 20
     --validation-seeds 4 --motion shared --out data]
@@ -14,7 +15,7 @@ import tempfile
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -31,7 +32,6 @@ from xew.protocol import (
     TEST_SEEDS_PER_TASK,
     TRAIN_SEEDS_PER_TASK,
     expand_robots,
-    seed_split,
     split_key,
 )
 from xew.sim_warp.cameras import demand_sight, get_views
@@ -41,7 +41,7 @@ from xew.sim_warp.inspection.checks import render_views
 from xew.sim_warp.manifest import PACKAGED, Manifest, read_manifest
 from xew.sim_warp.production.cells import Job
 from xew.sim_warp.production.produce import Production, make_scenes
-from xew.sim_warp.production.seeds import MOST_UNPAIRED, Family, demand_enough, plan_families
+from xew.sim_warp.production.seeds import MOST_UNPAIRED, Family, demand_enough, plan_families, plan_faults
 from xew.sim_warp.production.summary import yield_table
 from xew.sim_warp.production.warm_up import compile_on_devices
 from xew.sim_warp.robots import ROBOTS, RobotSpec, adopt_robots, get_robot, is_path
@@ -97,6 +97,9 @@ class Args:
     """Size of these views, such as 640x480; default: the camera's."""
     manifest: Path = PACKAGED
     """File with the seeds that are known to fail."""
+    faults: int = 0
+    """Number of commands of each accepted scene: the expert's, and others with drawn faults (docs/tasks.md). Their episodes are
+    kept whether the task is solved or not, with the seed fault * 10000000 + seed."""
     search: bool = False
     """Try every seed, ignoring the manifest."""
 
@@ -126,24 +129,32 @@ def generate(args: Args) -> list[Family]:
     manifest = Manifest() if args.search else read_manifest(args.manifest)
     teams = dict.fromkeys(SEED_STARTS, tuple(robots)) | dict.fromkeys(("test", "final"), tuple(tested))
     families = plan_seeds(args, teams, manifest)
+    speed = _Speed()
+    with start_workers(args, {**robots, **tested}) as make:
+        _complete(families, args, make, speed)
+        faulty = [more for family in families for more in plan_faults(family, args.faults)]
+        if faulty:
+            _complete(faulty, args, make, speed)
+    speed.print()
+    return [*families, *faulty]
+
+
+def _complete(
+    families: Sequence[Family], args: Args, make: Callable[[Sequence[Job]], Iterator[Timed]], speed: "_Speed"
+) -> None:
+    """Make the missing episodes of some families, and add all records to them."""
     _read_existing(families, args)
-    spent: dict[str, float] = defaultdict(float)
-    frames: Counter[str] = Counter()
     total = sum(family.wanted for family in families)
-    bar = tqdm(total=total, initial=sum(f.accepted for f in families), desc="accepted seeds", unit="seed")
-    with bar, start_workers(args, {**robots, **tested}) as make:
+    with tqdm(total=total, initial=sum(f.accepted for f in families), desc="accepted seeds", unit="seed") as bar:
         while jobs := {(family.task, job.seed): (family, job) for family in families for job in family.next_jobs()}:
             for records, seconds in make([job for _, job in jobs.values()]):
                 family, _ = jobs[records[0].task, records[0].seed]
                 before = family.accepted
                 for record in records:
                     family.add(record)
-                spent[family.task] += seconds
-                frames[family.task] += sum(record.frame_count for record in records if record.hashes)
+                speed.add(records, seconds)
                 bar.n += family.accepted - before
                 bar.set_postfix_str(f"{records[0].task} {records[0].seed}", refresh=True)
-    _print_speed(frames, spent)
-    return families
 
 
 def plan_seeds(args: Args, robots: Mapping[str, Sequence[str]], manifest: Manifest) -> list[Family]:
@@ -199,7 +210,7 @@ def _prepare_folder(out: Path) -> None:
         raise EpisodeError(f"cannot write to {out}: {error.strerror}. Choose another folder with --out.") from error
 
 
-def _read_existing(families: list[Family], args: Args) -> None:
+def _read_existing(families: Sequence[Family], args: Args) -> None:
     """Add the cells on disk to the families.
 
     Raises:
@@ -221,8 +232,7 @@ def _read_existing(families: list[Family], args: Args) -> None:
         for family in families:
             if args.unpaired and record.robot not in family.robots:
                 continue
-            same_family = seed_split(record.seed) == seed_split(family.first_seed)
-            if record.task == family.task and same_family:
+            if family.holds(record):
                 if record.source:
                     raise EpisodeError(
                         f"{folder} was imported ({record.source}): its seed is not the scene of {record.task} here. "
@@ -231,11 +241,22 @@ def _read_existing(families: list[Family], args: Args) -> None:
                 family.add(record)
 
 
-def _print_speed(frames: Counter[str], spent: dict[str, float]) -> None:
-    for task, seconds in spent.items():
-        print(
-            f"{task}: {frames[task]} frames in {seconds:.1f} process-seconds, {frames[task] / seconds:.1f} frames/s per process"
-        )
+@dataclass
+class _Speed:
+    """Frames made, and the workers' time for them, by task."""
+
+    frames: Counter[str] = field(default_factory=Counter)
+    spent: dict[str, float] = field(default_factory=lambda: defaultdict(float))
+
+    def add(self, records: Sequence[Record], seconds: float) -> None:
+        """Add the headers of one scene and the time for it [s]."""
+        self.spent[records[0].task] += seconds
+        self.frames[records[0].task] += sum(record.frame_count for record in records if record.hashes)
+
+    def print(self) -> None:
+        for task, seconds in self.spent.items():
+            count = self.frames[task]
+            print(f"{task}: {count} frames in {seconds:.1f} process-seconds, {count / seconds:.1f} frames/s per process")
 
 
 @user_errors

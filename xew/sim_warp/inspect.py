@@ -89,7 +89,7 @@ def main() -> None:
     cells, damaged = read_headers(args.data)
     print(yield_table([record for _, record in cells]))
     for folder, record in cells:
-        if not record.success:
+        if not record.is_kept:
             print(plain_line(f"{folder}: {record.failure}: {record.failure_detail}"))
     pictured = [(folder, record) for folder, record in cells if record.hashes]
     stored = [folder for folder, _ in pictured] + list_stored_views(args.data, damaged)

@@ -17,7 +17,7 @@ from xew.sim_warp.production.produce import Production, make_scenes, simulate_jo
 
 ROBOTS = ("franka_panda", SLOW)
 PRODUCTION = Production(Path("nowhere"), WITH_SLOW)
-CELL = {"task_name": TASK, "scene": SimpleNamespace(seed=0), "robot_name": "piper"}
+CELL = {"task_name": TASK, "seed": 0, "robot_name": "piper"}
 
 
 def make(

@@ -188,7 +188,7 @@ def _find_episode(rollout: Rollout, data: Path) -> Episode:
             "the data set that the rollout was made from: --data."
         )
     record = read_record(folder)
-    if not record.success:
+    if not record.is_kept:
         raise RolloutError(f"{rollout.folder} predicts an episode that was rejected ({record.failure}); delete this rollout.")
     source = rollout.header.get("source_hash")
     if source is not None and source != record.hashes.get("rgb"):

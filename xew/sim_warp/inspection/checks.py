@@ -101,7 +101,7 @@ def render_changes(folders: list[Path], change: str, out: Path) -> None:
     for key in sorted({folder.name for folder in folders}):
         if (data / KEPT / key).is_dir() and (robot := kept_robot(key, data)) is not None:
             keep_robot(robot, out)
-    failed = [record for record in _render_all(partial(_render_change, change=change, out=out), folders) if not record.success]
+    failed = [record for record in _render_all(partial(_render_change, change=change, out=out), folders) if not record.is_kept]
     print(f"{len(folders) - len(failed)} of {len(folders)} episodes rendered with the change {change} into {out}")
     for record in failed:
         print(f"{record.task} {record.seed} {record.robot}: {record.failure_detail}")

@@ -23,7 +23,7 @@ from xew.protocol import HEAD
 from xew.rollout import Rollout, find_rollouts, read_as_graded
 from xew.sim_warp.inspection.films import Row, difference_video, tile_frames, tile_size, write_film
 from xew.sim_warp.inspection.overlays import frame_psnr, overlay_data
-from xew.sim_warp.inspection.pictures import fit_picture
+from xew.sim_warp.inspection.pictures import describe, fit_picture
 from xew.sim_warp.robots import ROBOTS, recorded_robot
 
 __all__ = ["Page", "Predictions", "Scene", "choose_scenes", "find_predictions", "write_page"]
@@ -199,7 +199,7 @@ def _write_scene(number: int, scene: Scene, page: Page, out: Path) -> dict[str, 
     return {
         "task": scene.task,
         "seed": scene.seed,
-        "instruction": scene.cells[0][1].instruction,
+        "instruction": describe([record for _, record in scene.cells]),
         "script": f"{stem}.js",
         "left_out": scene.left_out,
     }

@@ -142,8 +142,14 @@ def contact_sheet(cells: list[tuple[Path, Record]], views: Sequence[str] = (HEAD
     names = np.concatenate([_label(record.robot, LABEL_WIDTH, HEIGHT + GAP) for _, record in cells])
     pictures = np.concatenate([names, tile(rows)], 1)
     record = cells[0][1]
-    title = f"{record.task}, seed {record.seed}: {record.instruction}"
+    title = f"{record.task}, seed {record.seed}: {describe([record for _, record in cells])}"
     return np.concatenate([_label(title, pictures.shape[1]), pictures])
+
+
+def describe(records: Sequence[Record]) -> str:
+    """The instruction of a scene, and of faulty commands the fault and the number of robots that succeed."""
+    first, solved = records[0], sum(record.success for record in records)
+    return f"{first.instruction} ({first.fault}: {solved} of {len(records)} succeed)" if first.fault else first.instruction
 
 
 def strip(folder: Path) -> np.ndarray:

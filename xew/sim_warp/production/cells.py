@@ -5,14 +5,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from xew.protocol import OWN_MOTION, SHARED_MOTION
+from xew.protocol import OWN_MOTION, SHARED_MOTION, join_fault, split_fault
 from xew.sim_warp.changes.scenes import make_plan, make_scene
 from xew.sim_warp.kinematics.expert import Commands, joint_commands
 from xew.sim_warp.kinematics.forward import tool_poses
 from xew.sim_warp.kinematics.own_motion import own_commands
 from xew.sim_warp.physics import Motion, World, simulate
 from xew.sim_warp.plan import Timeline, ToolPath
-from xew.sim_warp.production.outcome import find_failure, find_obstruction
+from xew.sim_warp.production.outcome import find_failure, find_obstruction, find_refusal, measure_outcome
 from xew.sim_warp.rendering.observe import Recording, scene_recording
 from xew.sim_warp.robots import ROBOTS, RobotSpec
 from xew.sim_warp.scene import Scene
@@ -26,6 +26,7 @@ class Job:
     task: str
     """Key of the registry or module:NAME."""
     seed: int
+    """Seed of the scene, with the number of a fault (`protocol.join_fault`)."""
     robots: tuple[str, ...]
     """Their names in episodes."""
     rejected: bool = False
@@ -57,7 +58,16 @@ class Cell:
     tool_pose: np.ndarray | None = None
     """[t 2 7] float32 measured tool poses, xyz [m] and quaternion xyzw, world; None without motion."""
     failure: tuple[str, str] | None = None
-    """One of `episode.FAILURES` and a sentence; None for success."""
+    """One of `episode.FAILURES` and a sentence; None for success, or for a faulty motion that physics allows."""
+    fault: int = 0
+    """Number of the commands' fault (`faults.FAULTS`); 0 for the expert's."""
+    outcome: tuple[bool, float] | None = None
+    """Success and progress of a faulty motion at its end; None for the expert, whose failure says it."""
+
+    @property
+    def seed(self) -> int:
+        """The seed of the episode: that of the scene, with the fault."""
+        return join_fault(self.fault, self.scene.seed)
 
     @property
     def task(self) -> Task:
@@ -81,7 +91,8 @@ def plan_cells(jobs: Sequence[Job], robots: Mapping[str, RobotSpec] = ROBOTS, de
     """Scene, plan and commands of every cell, by job; the commands of all cells of a robot are solved together on a device."""
     tasks = [get_task(job.task) for job in jobs]
     scenes = [make_scene(task, job.task, job.seed, job.change) for job, task in zip(jobs, tasks, strict=True)]
-    plans = [make_plan(task, scene) for task, scene in zip(tasks, scenes, strict=True)]
+    faults = [split_fault(job.seed)[0] for job in jobs]
+    plans = [make_plan(task, scene, fault) for task, scene, fault in zip(tasks, scenes, faults, strict=True)]
     seeds: list[list[Cell]] = [[] for _ in jobs]
     for name, kind in dict.fromkeys((robot, job.motion) for job in jobs for robot in job.robots):
         mine = [index for index, job in enumerate(jobs) if name in job.robots and job.motion == kind]
@@ -89,11 +100,9 @@ def plan_cells(jobs: Sequence[Job], robots: Mapping[str, RobotSpec] = ROBOTS, de
         planned = plan_motion(robot, [plans[index] for index in mine], kind, device)
         for index, (path, commands) in zip(mine, planned, strict=True):
             failure = None if commands.problem is None else ("plan", commands.problem)
-            job = jobs[index]
-            cell = Cell(
-                job.task, scenes[index], path, name, robot, commands, motion_kind=kind, change=job.change, failure=failure
-            )
-            seeds[index].append(cell)
+            job, fault = jobs[index], faults[index]
+            cell = Cell(job.task, scenes[index], path, name, robot, commands, motion_kind=kind, failure=failure, fault=fault)
+            seeds[index].append(replace(cell, change=job.change))
     return seeds
 
 
@@ -120,8 +129,13 @@ def simulate_cells(seeds: list[list[Cell]], device: str | None = None, batch: in
 def with_motion(cell: Cell, motion: Motion) -> Cell:
     """A planned cell with its simulated motion and its failure, if any."""
     tools = measured_tools(cell.robot, motion.joint_pos)
-    failure = find_failure(cell.task, cell.scene, cell.path, cell.commands.action, motion, tools)
-    moved = replace(cell, motion=motion, tool_pose=tools, failure=failure)
+    task, scene, path, action = cell.task, cell.scene, cell.path, cell.commands.action
+    if cell.fault:
+        failure = find_refusal(scene, path, motion, tools)
+        outcome = None if failure else measure_outcome(task, scene, action, motion, tools)
+    else:
+        failure, outcome = find_failure(task, scene, path, action, motion, tools), None
+    moved = replace(cell, motion=motion, tool_pose=tools, failure=failure, outcome=outcome)
     return moved if failure else replace(moved, failure=find_obstruction(moved.scene, moved.recording))
 
 

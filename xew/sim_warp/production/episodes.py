@@ -13,6 +13,7 @@ from xew.config import ConfigError
 from xew.episode import Record, States, read_record, write_episode
 from xew.protocol import CameraSpec, parse_change
 from xew.sim_warp.changes.looks import camera_of, stage_of
+from xew.sim_warp.faults import get_fault
 from xew.sim_warp.geometry.camera import spec_camera
 from xew.sim_warp.production.cells import Cell
 from xew.sim_warp.rendering.observe import Observation, keypoint_names, observe
@@ -45,11 +46,12 @@ def write_cell(cell: Cell, pixels: Pixels | None, out: Path, device: wp.Device, 
 def header(cell: Cell, device: wp.Device) -> Record:
     """The header of a cell without hashes."""
     reason, detail = cell.failure or (None, "")
+    success, progress = cell.outcome or (True, None)
     return Record(
         task=cell.task_name,
-        seed=cell.scene.seed,
+        seed=cell.seed,
         robot=cell.robot_name,
-        success=reason is None,
+        success=reason is None and success,
         failure=reason,
         failure_detail=detail,
         instruction=fill_instruction(cell.task, cell.scene),
@@ -62,6 +64,8 @@ def header(cell: Cell, device: wp.Device) -> Record:
         motion=cell.motion_kind,
         change=cell.change,
         camera=_camera(cell),
+        fault=str(get_fault(cell.fault) or ""),
+        progress=None if reason else progress,
     )
 
 

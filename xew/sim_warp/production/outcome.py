@@ -1,4 +1,7 @@
-"""The outcome of a motion: success, or one of `episode.FAILURES` with a sentence."""
+"""The outcome of a motion: success, or one of `episode.FAILURES` with a sentence.
+
+A motion of faulty commands has a success and a progress, and a failure only if it was refused.
+"""
 
 from dataclasses import replace
 
@@ -6,7 +9,7 @@ import numpy as np
 
 from xew.protocol import ARMS
 from xew.sim_warp.changes.clutter import find_struck
-from xew.sim_warp.changes.scenes import is_solved
+from xew.sim_warp.changes.scenes import is_solved, measure_progress
 from xew.sim_warp.physics import Motion
 from xew.sim_warp.physics.plausibility import find_implausible
 from xew.sim_warp.plan import ToolPath
@@ -31,17 +34,39 @@ def find_failure(
         action: [t 16] canonical commands [rad; grippers 0 to 1].
         tools: [t 2 7] measured tool poses, xyz [m] and quaternion xyzw, world.
     """
+    if collision := _find_collision(motion):
+        return collision
+    first, last = (moment(action, motion, tools, frame) for frame in (0, -1))
+    if is_solved(task, scene, first):
+        return "plan", "the scene is solved before it begins"
+    if not is_solved(task, scene, last):
+        return _find_lost_hold(scene, path, motion)
+    return _find_implausible(scene, path, motion, tools)
+
+
+def find_refusal(scene: Scene, path: ToolPath, motion: Motion, tools: np.ndarray) -> tuple[str, str] | None:
+    """The reason why a motion of faulty commands is no episode, as `find_failure`; missing the goal is none."""
+    return _find_collision(motion) or _find_implausible(scene, path, motion, tools)
+
+
+def measure_outcome(task: Task, scene: Scene, action: np.ndarray, motion: Motion, tools: np.ndarray) -> tuple[bool, float]:
+    """Success and progress at the end of a motion; arguments as of `find_failure`."""
+    first, last = (moment(action, motion, tools, frame) for frame in (0, -1))
+    return is_solved(task, scene, last), measure_progress(task, scene, first, last)
+
+
+def _find_collision(motion: Motion) -> tuple[str, str] | None:
+    """The failure of a simulation that broke down, or of arms that pressed into the table or each other."""
     if motion.overflow:
         return "overflow", "a contact or constraint buffer was too small, or the state was not finite"
     if motion.table_overlap > DEEPEST_IN_TABLE:
         return "plan", f"an arm pressed {1000 * motion.table_overlap:.1f} mm into the table"
     if motion.arm_overlap > DEEPEST_IN_ARM:
         return "plan", f"the arms pressed {1000 * motion.arm_overlap:.1f} mm into each other"
-    first, last = (moment(action, motion, tools, frame) for frame in (0, -1))
-    if is_solved(task, scene, first):
-        return "plan", "the scene is solved before it begins"
-    if not is_solved(task, scene, last):
-        return _find_lost_hold(scene, path, motion)
+    return None
+
+
+def _find_implausible(scene: Scene, path: ToolPath, motion: Motion, tools: np.ndarray) -> tuple[str, str] | None:
     problem = find_implausible(
         scene, path.holds, motion.object_pose, motion.penetration, motion.contact, tools, path.frame_rate
     )

@@ -118,7 +118,7 @@ def make_scenes(
             work.append(waiting.popleft())
         cells = [cell for group in results if isinstance(group, list) for cell in group]
         for cell in cells:
-            scene = scenes[cell.task_name, cell.scene.seed]
+            scene = scenes[cell.task_name, cell.seed]
             scene.cells.append(cell)
             scene.seconds += seconds / len(cells)
             if len(scene.cells) == len(scene.job.robots):

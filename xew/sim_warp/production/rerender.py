@@ -30,6 +30,7 @@ from xew.sim_warp.changes.scenes import change_of, demand_change, make_plan, mak
 from xew.sim_warp.embodiment.spec import RobotSpec
 from xew.sim_warp.kinematics.own_motion import own_commands
 from xew.sim_warp.physics.plausibility import find_implausible
+from xew.sim_warp.plan import Hold
 from xew.sim_warp.production.outcome import find_obstruction
 from xew.sim_warp.rendering.observe import observe, scene_recording
 from xew.sim_warp.rendering.render import Renderer
@@ -173,7 +174,8 @@ def render_changed(folder: Path, name: str, out: Path, renderer: Renderer) -> Re
     if failure := find_obstruction(
         scene, scene_recording(robot, scene, states.joint_pos, states.object_pose, states.object_joint)
     ):
-        failed = replace(changed, success=False, failure=failure[0], failure_detail=failure[1], hashes={}, files={})
+        refusal = {"success": False, "failure": failure[0], "failure_detail": failure[1], "progress": None}
+        failed = replace(changed, **refusal, hashes={}, files={})
         return read_record(write_episode(out, failed))
     seen, rgb, render = _render_view(robot, scene, states, changed, renderer)
     return read_record(write_episode(out, changed, seen, rgb, render))
@@ -191,14 +193,24 @@ def demand_plausible(folder: Path) -> None:
     """Raise EpisodeError if an accepted episode's motion is implausible (plausibility.py)."""
     record, states = read_record(folder), read_states(folder)
     scene = _sample_again(folder, record)
-    plan = make_plan(recorded_task(record.task), scene)
-    robot = recorded_robot(record.robot, data_folder(folder)) if record.motion == OWN_MOTION else None
-    holds = (own_commands(robot, [plan])[0][0] if robot else plan.path()).holds
     problem = find_implausible(
-        scene, holds, states.object_pose, states.penetration, states.contact, states.tool_pose, record.frame_rate
+        scene,
+        () if record.fault else _expert_holds(folder, record, scene),
+        states.object_pose,
+        states.penetration,
+        states.contact,
+        states.tool_pose,
+        record.frame_rate,
     )
     if problem:
         raise EpisodeError(f"{folder}: {problem}; delete it and run generate again.")
+
+
+def _expert_holds(folder: Path, record: Record, scene: Scene) -> tuple[Hold, ...]:
+    """The time spans in which the expert of an episode holds objects; a faulty hand may lose them."""
+    plan = make_plan(recorded_task(record.task), scene)
+    robot = recorded_robot(record.robot, data_folder(folder)) if record.motion == OWN_MOTION else None
+    return (own_commands(robot, [plan])[0][0] if robot else plan.path()).holds
 
 
 def _sample_again(folder: Path, record: Record) -> Scene:

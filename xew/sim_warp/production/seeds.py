@@ -1,4 +1,7 @@
-"""Scheduling of seeds: they are tried in order until enough are accepted. A seed is accepted if all robots succeed on it."""
+"""Scheduling of seeds: they are tried in order until enough are accepted. A seed is accepted if all robots succeed on it.
+
+The faults of an accepted scene are tried in the same way, in a drawn order: a fault is accepted if no robot is refused.
+"""
 
 import itertools
 from collections import defaultdict
@@ -6,10 +9,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from xew.episode import EpisodeError, Record
-from xew.protocol import SEED_STARTS, SHARED_MOTION
-from xew.sim_warp.changes.scenes import change_of
+from xew.protocol import SEED_STARTS, SHARED_MOTION, join_fault, seed_split, split_fault
+from xew.sim_warp.changes.scenes import change_of, make_scene
+from xew.sim_warp.faults import draw_faults
 from xew.sim_warp.manifest import Manifest
 from xew.sim_warp.production.cells import Job
+from xew.sim_warp.tasks import get_task
 
 TRIES_PER_SEED = 3
 SPARE_TRIES = 20
@@ -36,6 +41,11 @@ class Family:
     """Change of new episodes, or RANDOM_CHANGE."""
     done: dict[int, dict[str, Record]] = field(default_factory=lambda: defaultdict(dict))
 
+    def holds(self, record: Record) -> bool:
+        """Whether a cell is of this task and family; faulty cells are of their scene's `FaultFamily`."""
+        fault, _ = split_fault(record.seed)
+        return not fault and record.task == self.task and seed_split(record.seed) == seed_split(self.first_seed)
+
     def add(self, record: Record) -> None:
         """Add the record of a cell."""
         self.done[record.seed][record.robot] = record
@@ -47,9 +57,15 @@ class Family:
         return list(itertools.islice(candidates, TRIES_PER_SEED * self.wanted + SPARE_TRIES))
 
     @property
+    def accepted_seeds(self) -> list[int]:
+        """The first complete seeds on which no robot failed, at most `wanted`."""
+        good = (seed for seed in sorted(self.done) if not self._missing_robots(seed) and self._is_hopeful(seed))
+        return list(itertools.islice(good, self.wanted))
+
+    @property
     def accepted(self) -> int:
-        """Number of complete seeds on which no robot failed, at most `wanted`."""
-        return min(self.wanted, sum(not self._missing_robots(seed) and self._is_hopeful(seed) for seed in list(self.done)))
+        """Number of accepted seeds."""
+        return len(self.accepted_seeds)
 
     def next_jobs(self) -> list[Job]:
         """Missing cells of the first seeds, enough if no further robot fails.
@@ -68,13 +84,44 @@ class Family:
         return jobs
 
     def _missing_robots(self, seed: int) -> tuple[str, ...]:
-        """Robots without a record or, if all have succeeded, without an episode."""
+        """Robots without a record or, if none has failed, without an episode."""
         done = self.done[seed]
         return tuple(r for r in self.robots if r not in done or (self._is_hopeful(seed) and not done[r].hashes))
 
     def _is_hopeful(self, seed: int) -> bool:
         """Whether no robot has failed so far."""
-        return all(record.success for record in self.done[seed].values())
+        return all(record.is_kept for record in self.done[seed].values())
+
+
+@dataclass
+class FaultFamily(Family):
+    """The faulty seeds of one scene, whose base seed is `first_seed`."""
+
+    faults: tuple[int, ...] = ()
+    """Numbers of faults in the order in which they are tried."""
+
+    def holds(self, record: Record) -> bool:
+        """Whether a cell is of this scene and has a fault."""
+        fault, base = split_fault(record.seed)
+        return bool(fault) and record.task == self.task and base == self.first_seed
+
+    @property
+    def tries(self) -> list[int]:
+        """The seeds that may be tried."""
+        return [join_fault(fault, self.first_seed) for fault in self.faults]
+
+
+def plan_faults(family: Family, variants: int) -> list[FaultFamily]:
+    """The faulty seeds of a family's accepted scenes; with the expert, each scene is to have `variants` commands."""
+    families = []
+    for seed in family.accepted_seeds if variants > 1 else ():
+        task = get_task(family.task)
+        faults = draw_faults(task.plan, make_scene(task, family.task, seed))
+        wanted = min(variants - 1, len(faults))
+        families.append(
+            FaultFamily(family.task, seed, wanted, family.robots, motion=family.motion, change=family.change, faults=faults)
+        )
+    return families
 
 
 def plan_families(
