@@ -1,8 +1,8 @@
 """Poses of objects in a predicted video, from tracked points on their surfaces.
 
 A recursive least-squares fit: in each frame an object is expected where it was, or where a hand that holds it carries it, and
-the tracked points correct that. Pixels say little of depth, so it comes from the hand's known path. An object that no hand holds
-can slide and fall, and a lid can only turn about its hinge. An object of which no point is found stays as it was, or in its hand.
+the tracked points correct that. Pixels say little of depth, so it comes from the hand's known path. An object by itself can slide
+and fall, and a lid can only turn about its hinge. An object of which no point is found stays as it was, or in its hand.
 """
 
 import functools
@@ -20,18 +20,20 @@ PIXEL = 1.5
 """Standard deviation of tracked points [pixels]; their errors on one object are alike, so it is more than a single point's."""
 OUTLIER = 2.0
 """Number of standard deviations from which on a point's distance counts linearly (Huber)."""
-SLIDE, SLIP = 0.005, 0.003
-"""Standard deviation of an object's motion in a frame [m]: by itself, and in a hand that holds it."""
+SLIDE, SLIP, RISE = 0.005, 0.005, 0.0005
+"""Standard deviations of an object's motion in a frame [m]: by itself, in the hand that holds it, and by itself upward where no
+hand has taken it."""
+SETTLE, FALL = 0.002, 0.5
+"""Standard deviation of the vertical motion in a frame of an object that a hand has let go [m], and what each meter over its
+first place adds."""
 TURN = 0.05
-"""Standard deviation of its turn in a frame [rad]."""
-RISE, FALL = 0.002, 0.5
-"""Standard deviation of its vertical motion by itself: at its first height [m], and what a meter over that adds."""
+"""Standard deviation of an object's turn in a frame [rad]."""
 SWING = 0.1
 """Standard deviation of the turn of a lid in a frame [rad]."""
 REACH = 0.2
 """Largest distance [m] between a hand's tool and the origin of an object that it holds."""
-CHANGE = 2.0
-"""Cost of an object's being taken by a hand or released, in squared standard deviations."""
+CHANGE = 0.5
+"""Cost of a change, when an object is taken by a hand or let go, in squared standard deviations."""
 ITERATIONS = 6
 """Number of Gauss-Newton steps in a frame."""
 
@@ -88,13 +90,14 @@ def follow_bodies(
     Returns:
         [t o 4 4] float32.
     """
+    bodies, hands, lens, local = jax.tree.map(_in_float32, (bodies, hands, lens, local))
     count = len(bodies.start)
     own = jnp.asarray(body)[None] == jnp.arange(count)[:, None]
 
     def step(
         carry: tuple[jax.Array, jax.Array, jax.Array], now: tuple[jax.Array, ...]
     ) -> tuple[tuple[jax.Array, ...], jax.Array]:
-        pose, holder, before = carry
+        pose, mover, before = carry
         track, hand, closing, extrinsics = now
         found = jnp.isfinite(track).all(axis=-1)
         moved = hand @ jnp.linalg.inv(before)
@@ -106,13 +109,18 @@ def follow_bodies(
             jnp.asarray(lens.intrinsics, jnp.float32),
             extrinsics,
         )
-        pose, holder = jax.vmap(follow)(own & found[None], pose, holder, bodies)
-        return (pose, holder, hand), pose
+        pose, mover = jax.vmap(follow)(own & found[None], pose, mover, bodies)
+        return (pose, mover, hand), pose
 
-    start = jnp.asarray(bodies.start, jnp.float32), jnp.full(count, 0), jnp.asarray(hands.pose, jnp.float32)[0]
-    frames = [jnp.asarray(array, jnp.float32) for array in (tracks, hands.pose)]
-    frames += [jnp.asarray(hands.closing), jnp.asarray(lens.extrinsics, jnp.float32)]
-    return lax.scan(step, start, tuple(frames))[1]
+    start = bodies.start, jnp.zeros(count, int), hands.pose[0]
+    frames = _in_float32(tracks), hands.pose, hands.closing, lens.extrinsics
+    return lax.scan(step, start, frames)[1]
+
+
+def _in_float32(array: AnyArray) -> jax.Array:
+    """The same numbers in float32; flags as they are."""
+    array = jnp.asarray(array)
+    return array if array.dtype == jnp.bool_ else array.astype(jnp.float32)
 
 
 def _follow(
@@ -123,32 +131,31 @@ def _follow(
     extrinsics: jax.Array,
     found: jax.Array,
     pose: jax.Array,
-    holder: jax.Array,
+    mover: jax.Array,
     body: Bodies,
 ) -> tuple[jax.Array, jax.Array]:
-    """The pose of one body in a frame and who holds it, 0 for none, from its pose and holder in the frame before."""
+    """The pose of one body in a frame and who moves it, from both in the frame before.
+
+    It is moved by nobody yet (0), the left (1) or the right hand (2), or nobody any more (3).
+    """
     moved, hand, closing = hands
-    carried = jnp.concatenate([pose[None], moved @ pose])
-    near = jnp.linalg.norm(hand[:, :3, 3] - pose[:3, 3], axis=-1) < REACH
-    possible = jnp.concatenate([jnp.ones(1, bool), closing & near & ~body.hinged])
-    spread = jnp.concatenate([_spread(pose, body)[None], jnp.tile(jnp.diag(_deviations(SLIP, SLIP)), (2, 1, 1))])
-    pivot = jnp.where(body.hinged, body.anchor, jnp.nan)
-    fit = functools.partial(_fit, track, local, found, intrinsics, extrinsics, pivot)
-    poses, costs = jax.vmap(fit)(carried, spread)
-    costs = jnp.where(possible, costs + CHANGE * (jnp.arange(3) != holder), jnp.inf)
-    best = jnp.argmin(costs)
-    return poses[best], best
-
-
-def _deviations(sideways: float | jax.Array, upward: float | jax.Array) -> jax.Array:
-    return jnp.stack([*[jnp.float32(TURN)] * 3, jnp.float32(sideways), jnp.float32(sideways), jnp.float32(upward)])
-
-
-def _spread(pose: jax.Array, body: Bodies) -> jax.Array:
-    """Standard deviations [6 6] of the turn [rad] and motion [m] of a body that no hand holds, of six independent numbers."""
     height = jnp.maximum(pose[2, 3] - body.start[2, 3], 0)
+    alone = _spread(SLIDE, jnp.where(mover == 0, RISE, SETTLE + FALL * height))
     lid = jnp.zeros((6, 6)).at[:3, 0].set(SWING * body.axis)
-    return jnp.where(body.hinged, lid, jnp.diag(_deviations(SLIDE, RISE + FALL * height)))
+    spread = jnp.stack([jnp.where(body.hinged, lid, alone), *[_spread(SLIP, SLIP)] * 2])
+    anchor = jnp.where(body.hinged, body.anchor, jnp.nan)
+    fit = functools.partial(_fit, track, local, found, intrinsics, extrinsics, anchor)
+    poses, costs = jax.vmap(fit)(jnp.stack([pose, moved[0] @ pose, moved[1] @ pose]), spread)
+    near = jnp.linalg.norm(hand[:, :3, 3] - pose[None, :3, 3], axis=-1) < REACH
+    possible = jnp.concatenate([jnp.ones(1, bool), closing & near & ~body.hinged])
+    costs = jnp.where(possible, costs + jnp.where(jnp.arange(3) == mover % 3, 0, CHANGE), jnp.inf)
+    best = jnp.argmin(costs)
+    return poses[best], jnp.where((best == 0) & (mover > 0), 3, best)
+
+
+def _spread(sideways: float | jax.Array, upward: float | jax.Array) -> jax.Array:
+    """Standard deviations [6 6] of the turn [rad] and motion [m] of a free body in a frame, world, of independent numbers."""
+    return jnp.diag(jnp.stack([*[jnp.float32(TURN)] * 3, *[jnp.float32(sideways)] * 2, jnp.float32(upward)]))
 
 
 def _fit(
@@ -164,25 +171,25 @@ def _fit(
     """The pose near an expected one that fits the found points best, and its cost in squared standard deviations."""
 
     def residual(pose: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        world = local @ pose[:3, :3].T + pose[:3, 3]
-        seen = world @ extrinsics[:3, :3].T + extrinsics[:3, 3]
+        world = local @ pose[:3, :3].T + pose[None, :3, 3]
+        seen = world @ extrinsics[:3, :3].T + extrinsics[None, :3, 3]
         depth = jnp.maximum(seen[:, 2], 0.05)
         focal = jnp.diagonal(intrinsics)[:2]
-        pixels = focal * seen[:, :2] / depth[:, None] + intrinsics[:2, 2]
+        pixels = focal[None] * seen[:, :2] / depth[:, None] + intrinsics[None, :2, 2]
         of_seen = jnp.concatenate(
             [jnp.tile(jnp.eye(2), (len(local), 1, 1)), -(seen[:, :2] / depth[:, None])[..., None]], axis=-1
         )
-        slope = (focal[:, None] * of_seen / depth[:, None, None]) @ extrinsics[:3, :3]
+        slope = jnp.einsum("kpi,ij->kpj", focal[None, :, None] * of_seen / depth[:, None, None], extrinsics[:3, :3])
         return (track - pixels) / PIXEL, slope / PIXEL, world
 
     def step(state: tuple[jax.Array, jax.Array], _: None) -> tuple[tuple[jax.Array, jax.Array], None]:
         pose, deviation = state
         off, slope, world = residual(pose)
         pivot = _pivot(anchor, pose)
-        turning = jnp.cross(jnp.eye(3)[None], (world - pivot)[:, None])  # [k 3 3], row i: motion by a turn about axis i
+        turning = jnp.cross(jnp.eye(3)[None], (world - pivot[None])[:, None])  # [k 3 3], row i: motion by a turn about axis i
         motion = jnp.concatenate([jnp.swapaxes(turning, 1, 2), jnp.tile(jnp.eye(3), (len(world), 1, 1))], axis=-1)
-        jacobian = slope @ motion @ spread
-        weight = found / jnp.maximum(jnp.linalg.norm(off, axis=-1) / OUTLIER, 1)
+        jacobian = jnp.einsum("kpi,kij,jl->kpl", slope, motion, spread)
+        weight = jnp.where(found, 1 / jnp.maximum(jnp.linalg.norm(off, axis=-1) / OUTLIER, 1), 0)
         normal = jnp.einsum("kpi,k,kpj->ij", jacobian, weight, jacobian) + jnp.eye(6)
         change = jnp.linalg.solve(normal, jnp.einsum("kpi,k,kp->i", jacobian, weight, off) - deviation)
         return (_moved(pose, pivot, spread @ change), deviation + change), None
