@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from xew import episode
-from xew.dataset import find_accepted, find_records, read_dataset
+from xew.dataset import find_accepted, find_records, read_dataset, remove_left_overs
 from xew.episode import (
     HEIGHT,
     SCHEMA_VERSION,
@@ -30,7 +30,6 @@ from xew.episode import (
     read_record,
     read_states,
     read_video,
-    remove_left_overs,
     states_hash,
     verify_episode,
     write_episode,

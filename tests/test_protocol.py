@@ -32,8 +32,10 @@ from xew.protocol import (
     VARIANTS,
     Variant,
     expected_counts,
+    join_fault,
     reference,
     seed_split,
+    split_fault,
     split_key,
     training_counts,
     validation_split,
@@ -146,3 +148,11 @@ def test_a_smaller_study_counts_what_it_has() -> None:
     assert expected_counts(reference(), tasks=2, test_seeds=3, robots=robots) == {"ur5_wsg": 6, "piper": 6}
     assert training_counts(reference(), tasks=2, train_seeds=4, robots=robots) == {"ur5_wsg": 8}
     assert training_counts(VARIANTS["few_shot-franka_panda-2"], robots=robots) == {}
+
+
+@pytest.mark.parametrize("base", [0, 799_999, *SEED_STARTS.values(), 2_000_007])
+@pytest.mark.parametrize("fault", [0, 1, 27])
+def test_a_faulty_seed_is_of_the_family_of_its_scene(fault: int, base: int) -> None:
+    seed = join_fault(fault, base)
+    assert split_fault(seed) == (fault, base) and (seed == base) == (fault == 0)
+    assert seed_split(seed) == seed_split(base)

@@ -3,7 +3,9 @@
 `read_dataset` lists the folder each time, but opens only headers that are new or have changed since the last read.
 """
 
+import contextlib
 import os
+import shutil
 import time
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator
@@ -13,6 +15,7 @@ from functools import cached_property
 from pathlib import Path
 
 from xew.episode import TEMPORARY, EpisodeError, Record, data_folder, exact_rate, read_record
+from xew.files import check_place
 from xew.names import check_name, folder_name
 from xew.protocol import HEAD, MOTIONS, RANDOM_CHANGE, seed_split, split_fault
 
@@ -241,3 +244,11 @@ def explain_missing(data: Path, what: str = "episode") -> EpisodeError:
             root = Path(data).absolute().parents[levels]
             return EpisodeError(f"{data} lies inside a data set; pass the data set's root: {root}.")
     return EpisodeError(f"no {what} under {data}; make some: python -m xew.sim_warp.generate --out {data}")
+
+
+def remove_left_overs(data: Path) -> None:
+    """Remove incomplete episodes and robots of killed runs, except where links lead."""
+    for folder in [*Path(data).glob(f"*/*/{TEMPORARY}*"), *Path(data).glob(f"*/{TEMPORARY}*")]:
+        with contextlib.suppress(OSError):
+            check_place(folder / "file", within=Path(data))
+            shutil.rmtree(folder, ignore_errors=True)

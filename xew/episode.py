@@ -14,7 +14,6 @@ Shape letters, here and everywhere: t frames, h w c image, j joints, a action, o
 Quaternions are x y z w; the world frame has its origin under the table's center, x right, y away from the robot, z up.
 """
 
-import contextlib
 import hashlib
 import io
 import itertools
@@ -35,7 +34,7 @@ import numpy as np
 
 from xew.concurrency import PARSING
 from xew.config import ConfigError, parse
-from xew.files import LoadedFile, check_place, file_digest, load_file, read_json, sweep
+from xew.files import LoadedFile, file_digest, load_file, read_json, sweep
 from xew.names import EpisodeError as EpisodeError
 from xew.names import check_label, check_name, folder_name, name_of_folder, path_below
 from xew.protocol import CAMERA_SIZE, FRAME_RATE, HEAD_SPEC, MOTIONS, SHARED_MOTION, CameraSpec, parse_change
@@ -106,8 +105,7 @@ class States:
     penetration: np.ndarray
     """[t o] float32, deepest penetration between the object and a finger, the table or another object [m]."""
     keypoints: np.ndarray
-    """[t k 2] float32, origins of the robot's links by forward kinematics of `joint_pos`, pixels (x right, y down,
-    (0, 0) the center of the upper left pixel)."""
+    """[t k 2] float32, origins of the robot's links by forward kinematics of `joint_pos`, in the pixels of `project`."""
     keypoint_visible: np.ndarray
     """[t k] bool, in the image and not hidden by an object or by another link."""
     robot_mask: np.ndarray
@@ -161,8 +159,7 @@ class Record:
     camera: CameraSpec = HEAD_SPEC
     """The camera, with the place that it has on this robot."""
     fault: str = ""
-    """The fault of the commands and its severity, such as grasp_offset:20; empty for the expert. Such an episode is kept
-    whether it is a success or not; it has a failure only if it was refused."""
+    """The commands' fault, such as grasp_offset:20; empty for the expert. A faulty episode has a failure only if refused."""
     progress: float | None = None
     """The task's progress at the end, from 0 to 1, of a kept faulty episode."""
 
@@ -601,11 +598,3 @@ def verify_episode(folder: Path) -> Record:
         elif record.videos:
             read_pixels(folder, name, record=decoded)
     return record
-
-
-def remove_left_overs(data: Path) -> None:
-    """Remove incomplete episodes and robots of killed runs, except where links lead."""
-    for folder in [*Path(data).glob(f"*/*/{TEMPORARY}*"), *Path(data).glob(f"*/{TEMPORARY}*")]:
-        with contextlib.suppress(OSError):
-            check_place(folder / "file", within=Path(data))
-            shutil.rmtree(folder, ignore_errors=True)

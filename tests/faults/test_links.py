@@ -22,7 +22,8 @@ from xew.analysis.report import _write_report
 from xew.analysis.studies.ledger import Ledger
 from xew.analysis.studies.processes import wait_for_lock
 from xew.config import ConfigError, user_errors
-from xew.episode import EpisodeError, remove_left_overs
+from xew.dataset import remove_left_overs
+from xew.episode import EpisodeError
 from xew.files import check_place, copy_tree, hold_lock, open_own, replacing, write_text
 from xew.metrics.grade import Grades
 from xew.metrics.grading.scores import CellStore, baselines_folder, surfaces_folder

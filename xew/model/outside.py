@@ -20,8 +20,8 @@ import tyro
 from tqdm import tqdm
 
 from xew.config import ConfigError, admit, import_named, user_errors
-from xew.dataset import Episode, view_episode, view_folder
-from xew.episode import read_pixels, read_record, remove_left_overs
+from xew.dataset import Episode, remove_left_overs, view_episode, view_folder
+from xew.episode import read_pixels, read_record
 from xew.files import hold_lock
 from xew.model.episodes.choice import select_episodes
 from xew.model.episodes.commands import episode_command

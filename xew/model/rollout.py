@@ -19,8 +19,8 @@ from typing import Any, Literal
 from xew.command_line import find_path, parse_command
 from xew.compilation import take_memory_as_needed
 from xew.config import CONVERTER, ConfigError, admit, find_config, user_errors
-from xew.dataset import Episode, view_episode, view_folder
-from xew.episode import Record, episode_folder, read_record, remove_left_overs
+from xew.dataset import Episode, remove_left_overs, view_episode, view_folder
+from xew.episode import Record, episode_folder, read_record
 from xew.files import hold_lock, read_json
 from xew.model.episodes.choice import select_episodes
 from xew.model.experiment import Experiment, parse_experiment

@@ -200,9 +200,10 @@ def _swap_objects(planner: Planner, scene: Scene, rng: np.random.Generator, seve
 
 
 def _stop(planner: Planner, scene: Scene, rng: np.random.Generator, severity: float) -> Timeline | None:
-    """Both arms and grippers stop for good, `severity` % of the plan's time before its end."""
+    """Both arms and grippers stop for good, `severity` % of the time before the last move would end."""
     plan = planner(scene)
-    end = (1 - severity / 100) * plan.time
+    last = max((segment.end_time for segments in plan.segments for segment in segments[-1:]), default=plan.time)
+    end = (1 - severity / 100) * last
     for arm in (LEFT, RIGHT):
         begun = [segment for segment in plan.segments[arm] if segment.start_time < end]
         plan = _with_segments(plan, arm, [_cut(segment, end) for segment in begun])
@@ -256,14 +257,14 @@ def _jitter(planner: Planner, scene: Scene, rng: np.random.Generator, severity: 
 
 
 KINDS: tuple[tuple[str, str, Change, tuple[float, ...]], ...] = (
-    ("grasp_offset", "mm", _offset_grasp, (5, 10, 20, 40)),
-    ("close_late", "s", _close_late, (0.3, 0.6, 1.2)),
+    ("grasp_offset", "mm", _offset_grasp, (5, 10, 20, 30, 40)),
+    ("close_late", "s", _close_late, (0.3, 0.45, 0.6)),
     ("stay_open", "", _stay_open, (1,)),
     ("open_early", "%", _open_early, (10, 30, 60)),
-    ("miss_target", "mm", _miss_target, (20, 40, 80)),
+    ("miss_target", "mm", _miss_target, (20, 40, 60)),
     ("swap_objects", "", _swap_objects, (1,)),
     ("low_lift", "%", _lift_low, (50, 80, 95)),
-    ("stop", "%", _stop, (10, 30, 50, 70)),
+    ("stop", "%", _stop, (5, 10, 30, 60)),
     ("push", "mm", _push, (40, 60, 80)),
     ("jitter", "%", _jitter, (10, 20, 40)),
 )

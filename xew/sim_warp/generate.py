@@ -23,8 +23,8 @@ import tyro
 from tqdm import tqdm
 
 from xew.config import user_errors
-from xew.dataset import find_records, read_dataset
-from xew.episode import EpisodeError, Record, remove_left_overs
+from xew.dataset import find_records, read_dataset, remove_left_overs
+from xew.episode import EpisodeError, Record
 from xew.files import hold_lock
 from xew.protocol import (
     HEAD,

@@ -45,12 +45,15 @@ def find_failure(
 
 
 def find_refusal(scene: Scene, path: ToolPath, motion: Motion, tools: np.ndarray) -> tuple[str, str] | None:
-    """The reason why a motion of faulty commands is no episode, as `find_failure`; missing the goal is none."""
+    """The reason why a motion of faulty commands is no episode, as `find_failure`; missing the goal is none.
+
+    `tools` [t 2 7] are measured tool poses, xyz [m] and quaternion xyzw, world.
+    """
     return _find_collision(motion) or _find_implausible(scene, path, motion, tools)
 
 
 def measure_outcome(task: Task, scene: Scene, action: np.ndarray, motion: Motion, tools: np.ndarray) -> tuple[bool, float]:
-    """Success and progress at the end of a motion; arguments as of `find_failure`."""
+    """Success and progress at the end of a motion; arguments as of `find_failure`: commands [t 16], tool poses [t 2 7]."""
     first, last = (moment(action, motion, tools, frame) for frame in (0, -1))
     return is_solved(task, scene, last), measure_progress(task, scene, first, last)
 

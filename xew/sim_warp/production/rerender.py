@@ -174,8 +174,9 @@ def render_changed(folder: Path, name: str, out: Path, renderer: Renderer) -> Re
     if failure := find_obstruction(
         scene, scene_recording(robot, scene, states.joint_pos, states.object_pose, states.object_joint)
     ):
-        refusal = {"success": False, "failure": failure[0], "failure_detail": failure[1], "progress": None}
-        failed = replace(changed, **refusal, hashes={}, files={})
+        reason, detail = failure
+        refused = replace(changed, success=False, failure=reason, failure_detail=detail, progress=None)
+        failed = replace(refused, hashes={}, files={})
         return read_record(write_episode(out, failed))
     seen, rgb, render = _render_view(robot, scene, states, changed, renderer)
     return read_record(write_episode(out, changed, seen, rgb, render))
