@@ -379,7 +379,9 @@ def test_an_entry_of_the_registry_of_metrics_agrees_with_its_function() -> None:
     metrics = importlib.import_module("xew.metrics")
     kinds = importlib.import_module("xew.metrics.metric")
     masked = {kind: ["target_mask"] for kind in ("region", "robot", "bodies")}
-    others: dict[str, list[str]] = {"track": ["valid"]} | dict.fromkeys(("video", "mask", "outcome", "variants"), []) | masked
+    others: dict[str, list[str]] = (
+        {"track": ["valid"]} | {kind: [] for kind in ("video", "mask", "outcome", "variants")} | masked
+    )
     assert set(others) == set(kinds.INPUTS)
     for name, metric in metrics.METRICS.items():
         exported = metric.function.__name__

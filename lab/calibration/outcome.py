@@ -5,8 +5,8 @@ Writes <out>/outcome.md (tables by task and robot) and outcome.parquet (a row fo
 
 Cases: the true video, through a codec if one is named; and a render in which no object moves, through H.264.
 The rules, written before any result: the judge keeps a task if Pearson's r of judged and true progress is at least LEAST_R over
-INSTANTS frames of each video. A video shows success from the progress on, of CANDIDATES, that gives most right verdicts over all
-these frames; of equals, the middle one.
+INSTANTS frames of each video. A video shows success from the progress on, of CANDIDATES, that gives most right verdicts over
+these frames of kept tasks; of equals, the middle one.
 
     python -m lab.calibration.outcome --data data --codec configs/fixed.yaml --out calibration
 """

@@ -46,7 +46,7 @@ def swing(t: int) -> np.ndarray:
 
 
 def follow(motion: Motion, hand: Motion = rest, closed: int = T, lost: slice | None = None, lid: bool = False) -> np.ndarray:
-    """Poses [t 4 4] found of a body; its hand is closed from a frame on, and points are lost in all frames from the tenth on."""
+    """Poses [t 4 4] found of a body; its hand is closed from a frame on, and points are lost from frame 10 on."""
     true = np.stack([motion(t) for t in range(T)])
     world = np.einsum("tij,kj->tki", true[:, :3, :3], LOCAL) + true[:, None, :3, 3]
     tracks = project(world, INTRINSICS, EXTRINSICS)[0] + np.random.default_rng(1).normal(0, 0.5, (T, len(LOCAL), 2))

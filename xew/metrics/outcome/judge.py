@@ -165,7 +165,7 @@ class Outcome:
         return self.states.action[:, [column for _, column in ARMS]]
 
     def _measure(self, object_pose: np.ndarray, object_joint: np.ndarray, contact: np.ndarray, frame: int) -> float:
-        """Progress with the hands of a frame, and objects at poses [o 7] and angles [o] that touch them where `contact` [2 o]."""
+        """Progress with the hands of a frame and objects at poses [o 7] and angles [o], in contact where `contact` [2 o]."""
         from xew.sim_warp.changes.scenes import measure_progress
         from xew.sim_warp.tasks import Moment
 

@@ -1,8 +1,9 @@
 """Poses of objects in a predicted video, from tracked points on their surfaces.
 
 A recursive least-squares fit: in each frame an object is expected where it was, or where a hand that holds it carries it, and
-the tracked points correct that. Pixels say little of depth, so it comes from the hand's known path. An object by itself can slide
-and fall, and a lid can only turn about its hinge. An object of which no point is found stays as it was, or in its hand.
+the tracked points correct that. Pixels say little of depth, so it comes from the hand's known path. An object by itself can
+slide, and fall once a hand has let it go; a lid can only turn about its hinge. An object of which no point is found stays as it
+was, or in its hand.
 """
 
 import functools
