@@ -110,8 +110,9 @@ class Comparison:
     def judged_poses(self) -> np.ndarray:
         """Poses [t p 4 4] of the parts of `Truth.outcome` in the prediction. The truth was read with its outcome."""
         assert self.truth.outcome is not None, "asked for by read_truth"
-        tracks = np.concatenate([self.track(kind) for kind in ("object_points", "resting_points")], axis=1)
-        return self.truth.outcome.poses(tracks)
+        kinds = ("object_points", "resting_points")
+        tracks = np.concatenate([self.track(kind) for kind in kinds], axis=1)
+        return self.truth.outcome.poses(tracks, np.concatenate([self.points[kind].visible for kind in kinds], axis=1))
 
     def estimate_masks(self) -> np.ndarray:
         """Robot masks [t h w] bool of all frames of the prediction."""

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 from scipy.stats import rankdata
 
-from xew.protocol import split_fault
+from xew.protocol import FAULT_STRIDE
 from xew.statistics.bootstrap import Units, bootstrap_means
 from xew.statistics.correlation import pearson
 from xew.statistics.means import Mean, combine
@@ -91,7 +91,7 @@ def rank_policies(rows: pd.DataFrame, groups: Mapping[str, Sequence[str]]) -> pd
     graded = rows[rows["metric"] == "outcome_accuracy"].set_index(key)["value"]
     failed = graded.index.isin(pd.MultiIndex.from_frame(rows.loc[rows["metric"] == "hallucinated_success", key]))
     episodes = pd.DataFrame({"true": (~failed).astype(float), "judged": (failed ^ (graded == 1)).astype(float)}).reset_index()
-    episodes["policy"], episodes["seed"] = split_fault(episodes["seed"].to_numpy())
+    episodes = episodes.assign(policy=episodes["seed"] // FAULT_STRIDE, seed=episodes["seed"] % FAULT_STRIDE)
     table: list[tuple[Any, ...]] = []
     for group, robots in groups.items():
         for (model, condition), own in episodes[episodes["robot"].isin(robots)].groupby(["model", "condition"], sort=False):

@@ -68,7 +68,7 @@ def test_poses_of_objects_are_those_of_the_simulator(data: Path) -> None:
     truth = read_truth(folder, 12, ("outcome",))
     outcome = truth.outcome
     assert outcome is not None and outcome.variants == () and truth.surfaces is not None and truth.surfaces.resting is not None
-    poses = outcome.poses(truth.surfaces.resting.pixels)
+    poses = outcome.poses(truth.surfaces.resting.pixels, truth.surfaces.resting.visible)
     np.testing.assert_allclose(poses, outcome.true_poses(12), atol=2e-3)
     place, joint = outcome.place(poses[-1])
     np.testing.assert_allclose(place[0], outcome.states.object_pose[-1, 0], atol=2e-3)

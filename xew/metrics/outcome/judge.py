@@ -78,12 +78,17 @@ class Outcome:
         """What can move, in the order of `poses`."""
         return _parts(self.scene)
 
-    def poses(self, tracks: np.ndarray) -> np.ndarray:
-        """Poses [t p 4 4] of the parts, world, from tracks [t k 2] pixels, NaN where lost, from the first frame on."""
+    def poses(self, tracks: np.ndarray, visible: np.ndarray) -> np.ndarray:
+        """Poses [t p 4 4] of the parts, world, from the first frame on.
+
+        Args:
+            tracks: [t k 2] pixels, NaN where a point is lost.
+            visible: [t k] bool, where it should be seen.
+        """
         points = [fill_up(array, 0, POINT_BLOCK, value) for array, value in ((self.local, 0), (self.part, -1))]
-        filled = fill_up(fill_up(tracks, 1, POINT_BLOCK, np.nan), 0, FRAME_BLOCK, np.nan)
+        filled = [fill_up(fill_up(array, 1, POINT_BLOCK, 0), 0, FRAME_BLOCK, 0) for array in (tracks, visible)]
         with jax.default_device(jax.local_devices(backend="cpu")[0]):  # tracks are small
-            poses = follow_bodies(filled, *points, *self._known(len(tracks)))
+            poses = follow_bodies(*filled, *points, *self._known(len(tracks)))
         return np.asarray(poses)[: len(tracks), : len(self.parts)]
 
     def true_poses(self, frames: int) -> np.ndarray:

@@ -2,8 +2,8 @@
 
 A recursive least-squares fit: in each frame an object is expected where it was, or where a hand that holds it carries it, and
 the tracked points correct that. Pixels say little of depth, so it comes from the hand's known path. An object by itself can
-slide, and fall once a hand has let it go; a lid can only turn about its hinge. An object of which no point is found stays as it
-was, or in its hand.
+slide, and fall once a hand has let it go; a lid can only turn about its hinge. An object that is hidden stays as it was, or
+in its hand. One that should be seen but is not found stays as it was: no hand takes it away.
 """
 
 import functools
@@ -33,6 +33,9 @@ SWING = 0.1
 """Standard deviation of the turn of a lid in a frame [rad]."""
 REACH = 0.2
 """Largest distance [m] between a hand's tool and the origin of an object that it holds."""
+FEWEST_FOUND = 0.5
+"""Least share of an object's visible points that are found where it is seen at all: few places that happen to look like it are
+none."""
 CHANGE = 0.5
 """Cost of a change, when an object is taken by a hand or let go, in squared standard deviations."""
 ITERATIONS = 6
@@ -74,6 +77,7 @@ class Lens(NamedTuple):
 @jax.jit
 def follow_bodies(
     tracks: Float[AnyArray, "t k 2"],
+    visible: Bool[AnyArray, "t k"],
     local: Float[AnyArray, "k 3"],
     body: Int[AnyArray, " k"],
     bodies: Bodies,
@@ -84,6 +88,7 @@ def follow_bodies(
 
     Args:
         tracks: tracked points [pixels], NaN where lost.
+        visible: where each should be seen.
         local: their places in the frames of their bodies [m].
         body: the number of the body of each, -1 for none.
         bodies, hands, lens: what is known of them.
@@ -99,8 +104,10 @@ def follow_bodies(
         carry: tuple[jax.Array, jax.Array, jax.Array], now: tuple[jax.Array, ...]
     ) -> tuple[tuple[jax.Array, ...], jax.Array]:
         pose, mover, before = carry
-        track, hand, closing, extrinsics = now
-        found = jnp.isfinite(track).all(axis=-1)
+        track, seen, hand, closing, extrinsics = now
+        found = own & (seen & jnp.isfinite(track).all(axis=-1))[None]
+        found_count, seen_count = (jnp.sum(flags, axis=1, dtype=jnp.float32) for flags in (found, own & seen[None]))
+        missed = found_count < FEWEST_FOUND * seen_count
         moved = hand @ jnp.linalg.inv(before)
         follow = functools.partial(
             _follow,
@@ -110,11 +117,11 @@ def follow_bodies(
             jnp.asarray(lens.intrinsics, jnp.float32),
             extrinsics,
         )
-        pose, mover = jax.vmap(follow)(own & found[None], pose, mover, bodies)
+        pose, mover = jax.vmap(follow)(found & ~missed[:, None], missed, pose, mover, bodies)
         return (pose, mover, hand), pose
 
     start = bodies.start, jnp.zeros(count, int), hands.pose[0]
-    frames = _in_float32(tracks), hands.pose, hands.closing, lens.extrinsics
+    frames = _in_float32(tracks), jnp.asarray(visible), hands.pose, hands.closing, lens.extrinsics
     return lax.scan(step, start, frames)[1]
 
 
@@ -131,6 +138,7 @@ def _follow(
     intrinsics: jax.Array,
     extrinsics: jax.Array,
     found: jax.Array,
+    missed: jax.Array,
     pose: jax.Array,
     mover: jax.Array,
     body: Bodies,
@@ -148,7 +156,7 @@ def _follow(
     fit = functools.partial(_fit, track, local, found, intrinsics, extrinsics, anchor)
     poses, costs = jax.vmap(fit)(jnp.stack([pose, moved[0] @ pose, moved[1] @ pose]), spread)
     near = jnp.linalg.norm(hand[:, :3, 3] - pose[None, :3, 3], axis=-1) < REACH
-    possible = jnp.concatenate([jnp.ones(1, bool), closing & near & ~body.hinged])
+    possible = jnp.concatenate([jnp.ones(1, bool), closing & near & ~(body.hinged | missed)])
     costs = jnp.where(possible, costs + jnp.where(jnp.arange(3) == mover % 3, 0, CHANGE), jnp.inf)
     best = jnp.argmin(costs)
     return poses[best], jnp.where((best == 0) & (mover > 0), 3, best)
