@@ -97,7 +97,7 @@ class Truth:
     surfaces: Surfaces | None = None
     """Points on surfaces; None where they were not asked for."""
     outcome: Outcome | None = None
-    """What a judge of the outcome needs; None where it was not asked for or is not known."""
+    """Knowledge of a judge of the outcome; None where it was not asked for or is not known."""
 
     @cached_property
     def labels(self) -> np.ndarray:
