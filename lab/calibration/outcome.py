@@ -6,7 +6,7 @@ Writes <out>/outcome.md (tables by task and robot) and outcome.parquet (a row fo
 Cases: the true video, through a codec if one is named; and a render in which no object moves, through H.264.
 The rules, written before any result: the judge keeps a task if Pearson's r of judged and true progress is at least LEAST_R over
 INSTANTS frames of each video. A video shows success from the progress on, of CANDIDATES, that gives most right verdicts over
-these frames of kept tasks; of equals, the middle one.
+these frames of kept tasks; of equals, the middle one, or the lower of two.
 
     python -m lab.calibration.outcome --data data --codec configs/fixed.yaml --out calibration
 """
@@ -21,6 +21,7 @@ import pandas as pd
 import tyro
 from tqdm import tqdm
 
+from lab.calibration import calibrate
 from lab.calibration.calibrate import Row, as_markdown, choose, write
 from lab.calibration.perturbations import render_perturbation
 from lab.calibration.predictors import hold_objects, through_h264
@@ -75,7 +76,11 @@ def main(args: Args) -> None:
     demand_one_motion(args.data, [record for _, record in episodes])
     with hold_lock(args.out):
         rows = [
-            row for episode in tqdm(choose(episodes, args), unit="episode") for row in judge_episode(*episode, tracker, codec)
+            row
+            for episode in tqdm(
+                choose(episodes, calibrate.Args(args.data, seeds=args.seeds, episodes=args.episodes)), unit="episode"
+            )
+            for row in judge_episode(*episode, tracker, codec)
         ]
         table = pd.DataFrame(rows)
         text = report(table)
@@ -140,10 +145,10 @@ def correlation(rows: pd.DataFrame) -> float:
 
 
 def best_threshold(rows: pd.DataFrame) -> float:
-    """The one of CANDIDATES that gives most right verdicts; of equals, the middle one."""
+    """The one of CANDIDATES that gives most right verdicts; of equals, the middle one, or the lower of two."""
     right = [((rows["judged"] >= shown) == (rows["true"] >= 1)).mean() for shown in CANDIDATES]
     best = np.flatnonzero(np.isclose(right, max(right)))
-    return CANDIDATES[best[len(best) // 2]]
+    return CANDIDATES[best[(len(best) - 1) // 2]]
 
 
 def agreement_table(rows: pd.DataFrame, by: str) -> pd.DataFrame:

@@ -102,7 +102,7 @@ class Comparison:
         }
         if truth.surfaces is not None:
             known |= {"robot_points": truth.surfaces.robot, "object_points": truth.surfaces.objects}
-            if truth.outcome is not None:
+            if truth.outcome is not None and truth.surfaces.resting is not None:
                 known |= {"resting_points": truth.surfaces.resting}
         return known
 

@@ -175,7 +175,8 @@ def _find_surfaces(folder: Path, frames: int, cache: Path | None) -> Surfaces | 
     moves = (tracks.displacement[:frames].max(axis=0) > MOVED)[tracks.body]
     robot, objects, resting = (
         Points(
-            *(array[:frames, some] for array in (tracks.pixels, tracks.visible)),
+            tracks.pixels[:frames, some],
+            tracks.visible[:frames, some],
             tracks.body[some],
             finger[tracks.body[some]],
             tracks.local[some],

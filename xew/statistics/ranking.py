@@ -5,7 +5,7 @@ Agreement is measured by Pearson's r, Spearman's rank correlation, and the mean 
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pandas as pd
@@ -68,7 +68,7 @@ def policy_ranking(rows: pd.DataFrame) -> dict[str, Mean]:
     if policies < 2:
         raise ValueError(f"there are {policies} policies to rank, expected at least 2: the column policy.")
     units = Units(rows)
-    rates = [*bootstrap_means(table.to_numpy(), units.numbers(table.index), units.strata)]
+    rates = [*bootstrap_means(table.to_numpy(), units.numbers(cast(pd.MultiIndex, table.index)), units.strata)]
     known = [rate for rate in rates if rate is not None]
 
     def compare(function: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> Callable[..., np.ndarray]:

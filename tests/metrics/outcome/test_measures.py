@@ -20,13 +20,13 @@ def test_progress_error_is_the_absolute_difference() -> None:
 
 
 def test_outcome_accuracy_is_agreement_about_success() -> None:
-    judged, true = np.float32([0.9, 0.9, 0.5, 0.5, NAN]), np.float32([1, 0.9, 1, 0, 1])
+    judged, true = np.float32([0.97, 0.97, 0.5, 0.5, NAN]), np.float32([1, 0.9, 1, 0, 1])
     np.testing.assert_array_equal(outcome_accuracy(judged, true), np.float32([1, 0, 0, 1, NAN]))
     np.testing.assert_array_equal(outcome_accuracy(judged, true, shown=0.5), np.float32([1, 0, 1, 0, NAN]))
 
 
 def test_hallucinated_success_is_a_share_of_failures() -> None:
-    judged, true = np.float32([0.9, 1, 0.5, 0.1]), np.float32([0.9, 1, 0.5, 0])
+    judged, true = np.float32([0.97, 1, 0.5, 0.1]), np.float32([0.9, 1, 0.5, 0])
     assert float(hallucinated_success(judged, true)) == pytest.approx(1 / 3)
     assert np.isnan(hallucinated_success(judged, np.ones_like(true))), "there is no failure"
 

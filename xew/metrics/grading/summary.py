@@ -120,8 +120,8 @@ def ranking_to_markdown(ranking: pd.DataFrame) -> str:
     lines += ["| robot | model | Pearson's r | Spearman | MMRV | policies | scenes |", "|---|---|---|---|---|---|---|"]
     for (robot, *model), own in ranking.groupby(["robot", "model", "condition"], sort=False):
         cells = [
-            f"{row.value:.3f}" + ("" if math.isnan(row.low) else f" [{row.low:.3f}, {row.high:.3f}]")
-            for row in own.itertuples()
+            f"{value:.3f}" + ("" if math.isnan(low) else f" [{low:.3f}, {high:.3f}]")
+            for value, low, high in own[["value", "low", "high"]].to_numpy(float)
         ]
         counts = own[["policies", "scenes"]].iloc[0]
         lines.append(f"| {robot} | {title(tuple(model))} | {' | '.join(cells)} | {counts['policies']} | {counts['scenes']} |")

@@ -159,7 +159,8 @@ class Outcome:
                 anchor[i] = base[:3, :3] @ part.hinge.anchor + base[:3, 3]
                 axis[i] = base[:3, :3] @ part.hinge.axis / np.linalg.norm(part.hinge.axis)
         start = self._poses_of(states)[0]
-        bodies = Bodies(*(fill_up(array, 0, BODY_BLOCK) for array in (start, axis.any(axis=1), anchor, axis)))
+        hinged = np.array([part.hinge is not None for part in self.parts], bool)
+        bodies = Bodies(*(fill_up(array, 0, BODY_BLOCK) for array in (start, hinged, anchor, axis)))
         extrinsics = np.broadcast_to(states.extrinsics, (len(states.action), 4, 4))[frame]
         hands = Hands(matrix_from_pose(states.tool_pose[frame]), self._gripper[frame] < OPEN)
         return bodies, hands, Lens(states.intrinsics, extrinsics)

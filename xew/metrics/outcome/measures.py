@@ -18,7 +18,7 @@ Progress: TypeAlias = Float[AnyArray, " t"]
 Distances: TypeAlias = Float[AnyArray, " k"]
 """Distances from the truths of the k command variants of a scene, a counterfactual set."""
 
-SHOWN = 0.8
+SHOWN = 0.95
 """Judged progress from which on a video shows success, chosen on validation scenes by the rule of docs/metrics.md."""
 
 

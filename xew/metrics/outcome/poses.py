@@ -7,7 +7,7 @@ in its hand. One that should be seen but is not found stays as it was: no hand t
 """
 
 import functools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -40,8 +40,6 @@ CHANGE = 0.5
 """Cost of a change, when an object is taken by a hand or let go, in squared standard deviations."""
 ITERATIONS = 6
 """Number of Gauss-Newton steps in a frame."""
-
-Matrix = Float[AnyArray, "4 4"]
 
 
 class Bodies(NamedTuple):
@@ -96,13 +94,12 @@ def follow_bodies(
     Returns:
         [t o 4 4] float32.
     """
-    bodies, hands, lens, local = jax.tree.map(_in_float32, (bodies, hands, lens, local))
+    bodies, hands, lens = jax.tree.map(_in_float32, (bodies, hands, lens))
+    points = _in_float32(local)
     count = len(bodies.start)
     own = jnp.asarray(body)[None] == jnp.arange(count)[:, None]
 
-    def step(
-        carry: tuple[jax.Array, jax.Array, jax.Array], now: tuple[jax.Array, ...]
-    ) -> tuple[tuple[jax.Array, ...], jax.Array]:
+    def step(carry: Any, now: Any) -> tuple[Any, jax.Array]:
         pose, mover, before = carry
         track, seen, hand, closing, extrinsics = now
         found = own & (seen & jnp.isfinite(track).all(axis=-1))[None]
@@ -110,19 +107,15 @@ def follow_bodies(
         missed = found_count < FEWEST_FOUND * seen_count
         moved = hand @ jnp.linalg.inv(before)
         follow = functools.partial(
-            _follow,
-            jnp.nan_to_num(track),
-            local,
-            (moved, before, closing),
-            jnp.asarray(lens.intrinsics, jnp.float32),
-            extrinsics,
+            _follow, jnp.nan_to_num(track), points, (moved, before, closing), jnp.asarray(lens.intrinsics), extrinsics
         )
         pose, mover = jax.vmap(follow)(found & ~missed[:, None], missed, pose, mover, bodies)
         return (pose, mover, hand), pose
 
     start = bodies.start, jnp.zeros(count, int), hands.pose[0]
     frames = _in_float32(tracks), jnp.asarray(visible), hands.pose, hands.closing, lens.extrinsics
-    return lax.scan(step, start, frames)[1]
+    poses: jax.Array = lax.scan(step, start, frames)[1]
+    return poses
 
 
 def _in_float32(array: AnyArray) -> jax.Array:
