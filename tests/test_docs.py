@@ -267,7 +267,7 @@ def test_paths_and_modules_exist(page: Path) -> None:
     """Paths below xew, configs, examples, benchmarks and tests, and modules by their dotted names."""
     text = page.read_text()
     paths = re.findall(r"(?<![\w/.])((?:xew|configs|examples|benchmarks|tests)/[\w/.-]*\w)", text)
-    keys = ("xew/robot", "xew/task", "xew/seed", "xew/motion", "xew/change")  # columns of LeRobot exports
+    keys = ("xew/robot", "xew/task", "xew/seed", "xew/motion", "xew/change", "xew/fault")  # columns of LeRobot exports
     missing = [path for path in paths if not (ROOT / path).exists() and path not in keys]
     names = re.findall(r"(?<![\w/.])(xew(?:\.[a-z]\w*)+)(?![\w:/]|\.\w)", text)
     missing += [name for name in names if not is_importable(name)]

@@ -118,6 +118,18 @@ def test_an_episode_carries_its_change(data: Path, exported: Path, tmp_path: Pat
     assert "xew/change" not in parquet.read_table(exported / "meta/episodes").column_names
 
 
+def test_an_episode_carries_its_fault_and_its_outcome(data: Path, exported: Path, tmp_path: Path) -> None:
+    outcomes = {"": True, "stop:30": False}
+    for (folder, record), (fault, success) in zip(find_accepted(data), outcomes.items(), strict=False):
+        faulty = replace(record, fault=fault, success=success, progress=0.5 if fault else None)
+        write_episode(tmp_path / "data", faulty, read_states(folder), read_video(folder / "rgb.mkv"))
+    export(Args(tmp_path / "data", tmp_path / "out"))
+    assert parquet.read_table(tmp_path / "out/meta/episodes")["xew/fault"].to_pylist() == list(outcomes)
+    rows = parquet.read_table(tmp_path / "out/data").to_pandas().groupby("episode_index")
+    assert rows["next.success"].sum().tolist() == [1, 0] and rows["next.done"].sum().tolist() == [1, 1]
+    assert "xew/fault" not in parquet.read_table(exported / "meta/episodes").column_names
+
+
 def test_a_red_block_stays_red(tmp_path: Path) -> None:
     video = np.full((4, HEIGHT, WIDTH, 3), 255, np.uint8)
     video[:, 80:160, 100:200] = (200, 30, 20)

@@ -14,7 +14,7 @@ from tests.sim_warp.small import TASK, work_inline
 from xew.dataset import find_accepted, read_dataset
 from xew.episode import EpisodeError, Record, read_pixels, read_record
 from xew.protocol import FRAME_RATE, TEST_SEED_START, join_fault, seed_split, split_fault
-from xew.sim_warp.changes.scenes import make_plan, make_scene
+from xew.sim_warp.changes.scenes import make_plan, make_scene, measure_progress
 from xew.sim_warp.faults import FAULTS, draw_faults, get_fault, make_faulty
 from xew.sim_warp.generate import Args, generate
 from xew.sim_warp.inspection.checks import find_problem
@@ -25,6 +25,8 @@ from xew.sim_warp.production.cells import Job, plan_cells, simulate_cells
 from xew.sim_warp.production.summary import fault_table, sort_faults, yield_table
 from xew.sim_warp.scene import Scene, scene_hash, scene_rng
 from xew.sim_warp.tasks import TASKS
+from xew.sim_warp.tasks.place_empty_cup import COASTER_HEIGHT
+from xew.sim_warp.tasks.task import Moment
 
 NUMBERS = {str(fault): number for number, fault in enumerate(FAULTS, 1)}
 SEED = 2
@@ -176,6 +178,19 @@ def test_a_fault_is_the_same_over_a_raised_table(fault: str) -> None:
     assert np.allclose((raised - flat)[at(CUP.path(), CLOSE), ARM, :3], [0, 0, 0.03])
 
 
+@pytest.mark.parametrize(("share", "progress"), [(0.0, 0.0), (0.5, 0.545), (1.0, 1.0)])
+def test_progress_is_the_same_over_a_raised_table(share: float, progress: float) -> None:
+    task = TASKS["place_empty_cup"]
+    for change in ("", "height:6"):
+        scene = make_scene(task, "place_empty_cup", SEED, change)
+        pose = np.array([thing.pose for thing in scene.objects])
+        hands = np.ones(2), np.zeros((2, 2), bool)
+        first = Moment(pose, np.zeros(2), np.zeros((2, 7)), *hands)
+        way = np.append(pose[1, :3] + [0, 0, COASTER_HEIGHT] - pose[0, :3], np.zeros(4))
+        now = replace(first, object_pose=pose + share * np.outer([1, 0], way))
+        assert measure_progress(task, scene, first, now) == pytest.approx(progress, abs=0.001)
+
+
 def test_physics_decides_what_comes_of_a_fault() -> None:
     faults = {"grasp_offset:5": True, "stay_open": False, "stop:30": False}
     jobs = [Job("place_empty_cup", join_fault(NUMBERS[fault], SEED), ("ur5_wsg",)) for fault in faults]
@@ -266,5 +281,6 @@ def test_the_summary_counts_outcomes_by_fault() -> None:
     records = [outcome(10_000_000, robot, "stop:10", progress) for robot, progress in (("a", 1.0), ("b", 0.5))]
     records += [outcome(10_000_001, robot, "stop:10", progress) for robot, progress in (("a", 1.0), ("b", None))]
     assert fault_table(records).splitlines()[1].split() == ["stop:10", "2", "1", "2", "50%", "0.75", "plan", "1"]
+    assert fault_table(records).splitlines()[-1] == "commands by scene: 2 in 1"
     assert "tried" not in yield_table(records) and yield_table(records).splitlines()[0] == "motion: shared 4"
     assert describe(records[:2]) == " (stop:10: 1 of 2 succeed)"

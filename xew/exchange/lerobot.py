@@ -8,7 +8,8 @@ Writes DIR: meta/ (info, tasks, episodes, statistics), data/ (parquet, many epis
     observation.images.head       the head camera; observation.images.robot with --robot-video: the robot alone by its commands
     observation.images.cam_…      with --views, one video a camera by RoboTwin's names (CAMERA_NAMES)
     next.done, next.success       true at the last frame; next.success only if the task is solved
-The table of episodes has each episode's robot, task, seed and kind of motion (columns xew/…), and in changed scenes xew/change.
+The table of episodes has each episode's robot, task, seed and kind of motion (columns xew/…), in changed scenes xew/change, and
+with faults xew/fault.
 A feature that an imported episode lacks is omitted for the whole set. `fps` is the episodes' frame rate, 50 / 3 in simulated
 data; a set has one rate. Video is lossy; all other data are exact.
 
@@ -148,7 +149,7 @@ def _write(root: Path, chosen: Sequence[tuple[Path, Record]], vectors: Vectors, 
     tasks = {task: index for index, task in enumerate(dict.fromkeys(instructions))}
     rate = demand_one_rate(data_folder(chosen[0][0]), (record for _, record in chosen))
     episodes: list[dict[str, Any]] = []
-    changed = any(record.change for _, record in chosen)
+    changed, faulty = (any(getattr(record, name) for _, record in chosen) for name in ("change", "fault"))
     totals = _Totals()
     with _Tables(root / "data") as table:
         video_files = {key: _VideoFiles(root / "videos" / key, rate) for key in videos}
@@ -171,6 +172,7 @@ def _write(root: Path, chosen: Sequence[tuple[Path, Record]], vectors: Vectors, 
             row |= {"meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0}
             row |= {"xew/robot": record.robot, "xew/task": record.task, "xew/seed": record.seed, "xew/motion": record.motion}
             row |= {"xew/change": record.change} if changed else {}
+            row |= {"xew/fault": record.fault} if faulty else {}
             row |= {f"stats/{name}/{stat}": value for name, stats in statistics.items() for stat, value in stats.items()}
             episodes.append(row)
             start += row["length"]

@@ -16,12 +16,11 @@ from scipy.spatial.transform import Rotation
 from xew.episode import EpisodeError
 from xew.sim_warp.plan import GRIP_TIME, LEFT, RIGHT, Segment, Timeline, Tool, minimum_jerk
 from xew.sim_warp.scene import Scene, SceneObject, scene_rng
+from xew.sim_warp.tasks.task import GRIPPER_CLOSED
 
 Planner = Callable[[Scene], Timeline]
 Change = Callable[[Planner, Scene, np.random.Generator, float], Timeline | None]
 """Function (planner, scene, random stream, severity) -> the faulty plan; None if the plan cannot have the fault."""
-CLOSED = 0.2
-"""Command below which a gripper holds."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +60,7 @@ def _find_grips(plan: Timeline) -> list[_Grip]:
 def _grips_of_arm(plan: Timeline, arm: int) -> Iterator[_Grip]:
     times, values = np.array(plan.grips[arm]).T
     ends = np.array([segment.end_time for segment in plan.segments[arm]])
-    for close in np.flatnonzero((values[:-1] > CLOSED) & (values[1:] <= CLOSED)):
+    for close in np.flatnonzero((values[:-1] > GRIPPER_CLOSED) & (values[1:] <= GRIPPER_CLOSED)):
         later = np.flatnonzero(np.diff(values[close + 1 :]) > 0)
         opens = int(close + 1 + later[0]) if len(later) else None
         lift = int(np.searchsorted(ends, times[close], side="right"))
@@ -69,10 +68,15 @@ def _grips_of_arm(plan: Timeline, arm: int) -> Iterator[_Grip]:
         yield _Grip(arm, int(close), opens, lift, retreat)
 
 
-def _draw_grip(plan: Timeline, rng: np.random.Generator, released: bool = False) -> _Grip | None:
-    """One grip of the plan, or one that ends before the arm's last move; None if there is none."""
-    grips = [grip for grip in _find_grips(plan) if not released or grip.retreat < len(plan.segments[grip.arm])]
-    return grips[rng.integers(len(grips))] if grips else None
+def _of_a_grip(change: Callable[[Timeline, _Grip, np.random.Generator, float], Timeline], released: bool = False) -> Change:
+    """The fault of one drawn grip of a plan; with `released` of one that ends before the arm's last move."""
+
+    def make(planner: Planner, scene: Scene, rng: np.random.Generator, severity: float) -> Timeline | None:
+        plan = planner(scene)
+        grips = [grip for grip in _find_grips(plan) if not released or grip.retreat < len(plan.segments[grip.arm])]
+        return change(plan, grips[rng.integers(len(grips))], rng, severity) if grips else None
+
+    return make
 
 
 def _draw_direction(rng: np.random.Generator) -> np.ndarray:
@@ -109,54 +113,36 @@ def _move_stops(plan: Timeline, arm: int, first: int, last: int, change: Callabl
     return _with_segments(plan, arm, segments)
 
 
-def _offset_grasp(planner: Planner, scene: Scene, rng: np.random.Generator, severity: float) -> Timeline | None:
-    """The hand goes down, closes and lifts beside the right place by `severity` [mm]."""
-    plan = planner(scene)
-    grip, offset = _draw_grip(plan, rng), severity / 1000 * _draw_direction(rng)
-    if grip is None:
-        return None
+def _offset_grasp(plan: Timeline, grip: _Grip, rng: np.random.Generator, severity: float) -> Timeline:
+    """The hand goes down, closes and lifts next to the right place by `severity` [mm]."""
+    offset = severity / 1000 * _draw_direction(rng)
     first, last = (grip.lift - 1, grip.lift + 1) if grip.lift else (1, len(plan.segments[grip.arm]))
     return _move_stops(plan, grip.arm, max(1, first), last, lambda tool: tool.moved(*offset))
 
 
-def _miss_target(planner: Planner, scene: Scene, rng: np.random.Generator, severity: float) -> Timeline | None:
-    """The hand sets the object down beside its place by `severity` [mm]."""
-    plan = planner(scene)
-    grip, offset = _draw_grip(plan, rng, released=True), severity / 1000 * _draw_direction(rng)
-    if grip is None:
-        return None
+def _miss_target(plan: Timeline, grip: _Grip, rng: np.random.Generator, severity: float) -> Timeline:
+    """The hand sets the object down next to its place by `severity` [mm]."""
+    offset = severity / 1000 * _draw_direction(rng)
     return _move_stops(plan, grip.arm, grip.retreat - 1, grip.retreat + 1, lambda tool: tool.moved(*offset))
 
 
-def _close_late(planner: Planner, scene: Scene, rng: np.random.Generator, severity: float) -> Timeline | None:
+def _close_late(plan: Timeline, grip: _Grip, rng: np.random.Generator, severity: float) -> Timeline:
     """The gripper begins to close `severity` [s] late, while the arm moves on."""
-    plan = planner(scene)
-    grip = _draw_grip(plan, rng)
-    if grip is None:
-        return None
     knots = plan.grips[grip.arm]
     latest = plan.time if grip.open is None else knots[grip.open][0]
     closing = [(min(latest, time + severity), value) for time, value in knots[grip.close : grip.close + 2]]
     return _with_knots(plan, grip.arm, [*knots[: grip.close], *closing, *knots[grip.close + 2 :]])
 
 
-def _stay_open(planner: Planner, scene: Scene, rng: np.random.Generator, severity: float) -> Timeline | None:
+def _stay_open(plan: Timeline, grip: _Grip, rng: np.random.Generator, severity: float) -> Timeline:
     """The gripper does not close."""
-    plan = planner(scene)
-    grip = _draw_grip(plan, rng)
-    if grip is None:
-        return None
     knots = plan.grips[grip.arm]
     after = [] if grip.open is None else [(knots[grip.open][0], knots[grip.close][1]), *knots[grip.open + 1 :]]
     return _with_knots(plan, grip.arm, [*knots[: grip.close + 1], *after])
 
 
-def _open_early(planner: Planner, scene: Scene, rng: np.random.Generator, severity: float) -> Timeline | None:
+def _open_early(plan: Timeline, grip: _Grip, rng: np.random.Generator, severity: float) -> Timeline:
     """The gripper opens before its time, by `severity` % of the time for which it should hold."""
-    plan = planner(scene)
-    grip = _draw_grip(plan, rng)
-    if grip is None:
-        return None
     knots = plan.grips[grip.arm]
     closed, held = knots[grip.close + 1]
     until, after = (plan.time, []) if grip.open is None else (knots[grip.open][0], knots[grip.open + 1 :])
@@ -223,12 +209,9 @@ def _cut(segment: Segment, end: float) -> Segment:
     return replace(segment, end_time=end, waypoints=waypoints)
 
 
-def _push(planner: Planner, scene: Scene, rng: np.random.Generator, severity: float) -> Timeline | None:
+def _push(plan: Timeline, grip: _Grip, rng: np.random.Generator, severity: float) -> Timeline:
     """Before it retreats, the opened hand moves sideways by `severity` [mm] and pushes what it has set down."""
-    plan = planner(scene)
-    grip, side = _draw_grip(plan, rng, released=True), rng.choice([-1.0, 1.0])
-    if grip is None:
-        return None
+    side = rng.choice([-1.0, 1.0])
     segments = list(plan.segments[grip.arm])
     start, *others = segments[grip.retreat].waypoints
     across = start.rotation.apply([0.0, 1.0, 0.0]) * [1, 1, 0]
@@ -257,20 +240,21 @@ def _jitter(planner: Planner, scene: Scene, rng: np.random.Generator, severity: 
 
 
 KINDS: tuple[tuple[str, str, Change, tuple[float, ...]], ...] = (
-    ("grasp_offset", "mm", _offset_grasp, (5, 10, 20, 30, 40)),
-    ("close_late", "s", _close_late, (0.3, 0.45, 0.6)),
-    ("stay_open", "", _stay_open, (1,)),
-    ("open_early", "%", _open_early, (10, 30, 60)),
-    ("miss_target", "mm", _miss_target, (20, 40, 60)),
+    ("grasp_offset", "mm", _of_a_grip(_offset_grasp), (5, 10, 20, 30, 40)),
+    ("close_late", "s", _of_a_grip(_close_late), (0.3, 0.45, 0.6)),
+    ("stay_open", "", _of_a_grip(_stay_open), (1,)),
+    ("open_early", "%", _of_a_grip(_open_early), (10, 30, 60)),
+    ("miss_target", "mm", _of_a_grip(_miss_target, released=True), (20, 40, 60)),
     ("swap_objects", "", _swap_objects, (1,)),
     ("low_lift", "%", _lift_low, (50, 80, 95)),
     ("stop", "%", _stop, (5, 10, 30, 60)),
-    ("push", "mm", _push, (40, 60, 80)),
+    ("push", "mm", _of_a_grip(_push, released=True), (40, 60, 80)),
     ("jitter", "%", _jitter, (10, 20, 40)),
 )
-"""Name, unit of the severity, change of the plan, and severities, of which each is worse than the one before."""
+"""Name, unit of the severity, change of the plan, and severities, of which each is worse than the one before. Seeds number the
+faults in this order: add kinds at the end, and severities as another line there."""
 FAULTS = tuple(Fault(name, severity, unit, change) for name, unit, change, severities in KINDS for severity in severities)
-"""All faults. A seed names a fault by its place here, from 1 on: new faults go to the end."""
+"""All faults. A seed names a fault by its place here, from 1 on."""
 
 
 def get_fault(number: int) -> Fault | None:

@@ -37,11 +37,12 @@ from xew.protocol import (
 from xew.sim_warp.cameras import demand_sight, get_views
 from xew.sim_warp.changes.scenes import check_change, demand_change
 from xew.sim_warp.devices.workers import Workers, choose_physics, find_devices, quiet_warp, worker_count
+from xew.sim_warp.faults import FAULTS
 from xew.sim_warp.inspection.checks import render_views
 from xew.sim_warp.manifest import PACKAGED, Manifest, read_manifest
 from xew.sim_warp.production.cells import Job
 from xew.sim_warp.production.produce import Production, make_scenes
-from xew.sim_warp.production.seeds import MOST_UNPAIRED, Family, demand_enough, plan_families, plan_faults
+from xew.sim_warp.production.seeds import MOST_UNPAIRED, Family, FaultFamily, demand_enough, plan_families, plan_faults
 from xew.sim_warp.production.summary import yield_table
 from xew.sim_warp.production.warm_up import compile_on_devices
 from xew.sim_warp.robots import ROBOTS, RobotSpec, adopt_robots, get_robot, is_path
@@ -175,6 +176,10 @@ def _check(args: Args) -> None:
         get_task(task)
     if args.workers is not None and args.workers < 1:
         raise EpisodeError(f"--workers is {args.workers}; expected at least 1; omit it for the default.")
+    if not 0 <= args.faults <= len(FAULTS) + 1:
+        raise EpisodeError(
+            f"--faults is {args.faults}; expected 2 to {len(FAULTS) + 1} commands a scene, or 0 for the expert's."
+        )
     if not args.tasks or not args.robots or min(args.train_seeds, args.test_seeds) < 0 or args.batch < 1:
         raise EpisodeError(
             f"found {len(args.tasks)} tasks, {len(args.robots)} robots, {args.train_seeds} training and {args.test_seeds} test "
@@ -274,7 +279,7 @@ def main() -> None:
         if views:
             render_views(read_dataset(args.folder).accepted, views)
     print(yield_table([record for family in families for seed in family.done.values() for record in seed.values()]))
-    demand_enough(families)
+    demand_enough([family for family in families if not isinstance(family, FaultFamily)])  # a set may be smaller
 
 
 if __name__ == "__main__":

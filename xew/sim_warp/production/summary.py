@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from xew.dataset import count_motions
 from xew.episode import Record
 from xew.names import plain_line
+from xew.protocol import split_fault
 
 
 def yield_table(records: Sequence[Record]) -> str:
@@ -46,8 +47,12 @@ def _list_kinds(records: Sequence[Record]) -> list[str]:
 
 
 def fault_table(records: Sequence[Record]) -> str:
-    """Table of scenes, refused scenes, episodes, successes and mean progress by fault, and reasons of refusal by cell."""
+    """Table of scenes, refused scenes, episodes, successes and mean progress by fault, and reasons of refusal by cell.
+
+    The last line counts scenes by the number of their commands, with the expert's.
+    """
     width = max(len("fault"), *(len(record.fault) for record in records))
+    accepted: set[tuple[str, int]] = set()
     lines = [f"{'fault':<{width}} {'scenes':>6}{'refused':>8}{'episodes':>9}{'success':>8}{'progress':>9}  reasons"]
     for fault in sorted({record.fault for record in records}, key=sort_faults):
         tried = [record for record in records if record.fault == fault]
@@ -60,7 +65,10 @@ def fault_table(records: Sequence[Record]) -> str:
         lines.append(
             f"{fault:<{width}} {scenes:>6}{len(refused):>8}{len(kept):>9}{success:>8.0%}{progress:>9.2f}  {listed}".rstrip()
         )
-    return "\n".join(lines)
+        accepted |= {(record.task, record.seed) for record in kept}
+    sets = Counter((task, split_fault(seed)[1]) for task, seed in accepted)
+    sizes = ", ".join(f"{size + 1} in {count}" for size, count in sorted(Counter(sets.values()).items()))
+    return "\n".join([*lines, f"commands by scene: {sizes or 'none'}"])
 
 
 def sort_faults(fault: str) -> tuple[str, float]:

@@ -1,4 +1,4 @@
-"""Registry of tasks: one file each with the functions sample, plan and success.
+"""Registry of tasks: one file each with the functions sample, plan, success and approach.
 
 To add one, write a file with `TASK = Task(...)` here and add its line to `TASKS`; outside the repository write it
 anywhere importable and name it `module:TASK` wherever a task is asked for.
