@@ -38,6 +38,8 @@ FEWEST_FOUND = 0.5
 none."""
 CHANGE = 0.5
 """Cost of a change, when an object is taken by a hand or let go, in squared standard deviations."""
+NEAREST = 0.05
+"""Least depth of a point [m]."""
 ITERATIONS = 6
 """Number of Gauss-Newton steps in a frame."""
 
@@ -70,6 +72,17 @@ class Lens(NamedTuple):
     intrinsics: Float[AnyArray, "3 3"]
     extrinsics: Float[AnyArray, "t 4 4"]
     """World to camera [m]."""
+
+
+class _Seen(NamedTuple):
+    """Tracked points in one frame, and the camera that sees them."""
+
+    track: jax.Array
+    """[k 2] pixels."""
+    local: jax.Array
+    """[k 3] m, in the frames of their bodies."""
+    intrinsics: jax.Array
+    extrinsics: jax.Array
 
 
 @jax.jit
@@ -106,9 +119,8 @@ def follow_bodies(
         found_count, seen_count = (jnp.sum(flags, axis=1, dtype=jnp.float32) for flags in (found, own & seen[None]))
         missed = found_count < FEWEST_FOUND * seen_count
         moved = hand @ jnp.linalg.inv(before)
-        follow = functools.partial(
-            _follow, jnp.nan_to_num(track), points, (moved, before, closing), jnp.asarray(lens.intrinsics), extrinsics
-        )
+        seen_points = _Seen(jnp.nan_to_num(track), points, jnp.asarray(lens.intrinsics), extrinsics)
+        follow = functools.partial(_follow, seen_points, (moved, before, closing))
         pose, mover = jax.vmap(follow)(found & ~missed[:, None], missed, pose, mover, bodies)
         return (pose, mover, hand), pose
 
@@ -125,11 +137,8 @@ def _in_float32(array: AnyArray) -> jax.Array:
 
 
 def _follow(
-    track: jax.Array,
-    local: jax.Array,
+    points: _Seen,
     hands: tuple[jax.Array, jax.Array, jax.Array],
-    intrinsics: jax.Array,
-    extrinsics: jax.Array,
     found: jax.Array,
     missed: jax.Array,
     pose: jax.Array,
@@ -146,7 +155,7 @@ def _follow(
     lid = jnp.zeros((6, 6)).at[:3, 0].set(SWING * body.axis)
     spread = jnp.stack([jnp.where(body.hinged, lid, alone), *[_spread(SLIP, SLIP)] * 2])
     anchor = jnp.where(body.hinged, body.anchor, jnp.nan)
-    fit = functools.partial(_fit, track, local, found, intrinsics, extrinsics, anchor)
+    fit = functools.partial(_fit, points, found, anchor)
     poses, costs = jax.vmap(fit)(jnp.stack([pose, moved[0] @ pose, moved[1] @ pose]), spread)
     near = jnp.linalg.norm(hand[:, :3, 3] - pose[None, :3, 3], axis=-1) < REACH
     possible = jnp.concatenate([jnp.ones(1, bool), closing & near & ~(body.hinged | missed)])
@@ -160,60 +169,47 @@ def _spread(sideways: float | jax.Array, upward: float | jax.Array) -> jax.Array
     return jnp.diag(jnp.stack([*[jnp.float32(TURN)] * 3, *[jnp.float32(sideways)] * 2, jnp.float32(upward)]))
 
 
-def _fit(
-    track: jax.Array,
-    local: jax.Array,
-    found: jax.Array,
-    intrinsics: jax.Array,
-    extrinsics: jax.Array,
-    anchor: jax.Array,
-    pose: jax.Array,
-    spread: jax.Array,
-) -> tuple[jax.Array, jax.Array]:
-    """The pose near an expected one that fits the found points best, and its cost in squared standard deviations."""
+def _fit(points: _Seen, found: jax.Array, anchor: jax.Array, pose: jax.Array, spread: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The pose near an expected one that fits the found points best, and its cost in squared standard deviations.
 
-    def residual(pose: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        world = local @ pose[:3, :3].T + pose[None, :3, 3]
-        seen = world @ extrinsics[:3, :3].T + extrinsics[None, :3, 3]
-        depth = jnp.maximum(seen[:, 2], 0.05)
-        focal = jnp.diagonal(intrinsics)[:2]
-        pixels = focal[None] * seen[:, :2] / depth[:, None] + intrinsics[None, :2, 2]
-        of_seen = jnp.concatenate(
-            [jnp.tile(jnp.eye(2), (len(local), 1, 1)), -(seen[:, :2] / depth[:, None])[..., None]], axis=-1
-        )
-        slope = jnp.einsum("kpi,ij->kpj", focal[None, :, None] * of_seen / depth[:, None, None], extrinsics[:3, :3])
-        return (track - pixels) / PIXEL, slope / PIXEL, world
+    Args:
+        points: of all bodies.
+        found: [k] bool, which of them count.
+        anchor: [3] the point that the body turns about; NaN for its origin.
+        pose: [4 4] where it is expected.
+        spread: [6 6] as of `_spread`.
+    """
+
+    def off(pose: jax.Array) -> jax.Array:
+        """[k 2] how far the points are from where a pose has them, in standard deviations."""
+        return (points.track - _project(points, pose)) / PIXEL
 
     def step(state: tuple[jax.Array, jax.Array], _: None) -> tuple[tuple[jax.Array, jax.Array], None]:
         pose, deviation = state
-        off, slope, world = residual(pose)
-        pivot = _pivot(anchor, pose)
-        turning = jnp.cross(jnp.eye(3)[None], (world - pivot[None])[:, None])  # [k 3 3], row i: motion by a turn about axis i
-        motion = jnp.concatenate([jnp.swapaxes(turning, 1, 2), jnp.tile(jnp.eye(3), (len(world), 1, 1))], axis=-1)
-        jacobian = jnp.einsum("kpi,kij,jl->kpl", slope, motion, spread)
-        weight = jnp.where(found, 1 / jnp.maximum(jnp.linalg.norm(off, axis=-1) / OUTLIER, 1), 0)
-        normal = jnp.einsum("kpi,k,kpj->ij", jacobian, weight, jacobian) + jnp.eye(6)
-        change = jnp.linalg.solve(normal, jnp.einsum("kpi,k,kp->i", jacobian, weight, off) - deviation)
-        return (_moved(pose, pivot, spread @ change), deviation + change), None
+        slope = -jax.jacfwd(lambda change: off(_move(pose, anchor, spread @ change)))(jnp.zeros(6))
+        left = off(pose)
+        weight = jnp.where(found, 1 / jnp.maximum(jnp.linalg.norm(left, axis=-1) / OUTLIER, 1), 0)
+        normal = jnp.einsum("kpi,k,kpj->ij", slope, weight, slope) + jnp.eye(6)
+        change = jnp.linalg.solve(normal, jnp.einsum("kpi,k,kp->i", slope, weight, left) - deviation)
+        return (_move(pose, anchor, spread @ change), deviation + change), None
 
     (pose, deviation), _ = lax.scan(step, (pose, jnp.zeros(6)), None, ITERATIONS)
-    far = jnp.linalg.norm(residual(pose)[0], axis=-1)
+    far = jnp.linalg.norm(off(pose), axis=-1)
     huber = jnp.where(far < OUTLIER, far**2, OUTLIER * (2 * far - OUTLIER))
     return pose, jnp.sum(jnp.where(found, huber, 0)) + jnp.sum(deviation**2)
 
 
-def _pivot(anchor: jax.Array, pose: jax.Array) -> jax.Array:
-    """The point [3] that a body turns about: its anchor, or, if that is NaN, its origin."""
-    return jnp.where(jnp.isnan(anchor), pose[:3, 3], anchor)
+def _project(points: _Seen, pose: jax.Array) -> jax.Array:
+    """Pixels [k 2] of points on a body at a pose [4 4]."""
+    to_camera = points.extrinsics @ pose
+    seen = points.local @ to_camera[:3, :3].T + to_camera[None, :3, 3]
+    pixels = seen @ points.intrinsics.T / jnp.maximum(seen[:, 2:], NEAREST)
+    return pixels[:, :2]
 
 
-def _moved(pose: jax.Array, pivot: jax.Array, twist: jax.Array) -> jax.Array:
-    """A pose [4 4] turned about a pivot [3] and moved by a twist [6], rad and m, world."""
-    turn = _rotation(twist[:3])
+def _move(pose: jax.Array, anchor: jax.Array, twist: jax.Array) -> jax.Array:
+    """A pose [4 4] turned about an anchor [3], or its origin if that is NaN, and moved: by a twist [6], rad and m, world."""
+    pivot = jnp.where(jnp.isnan(anchor), pose[:3, 3], anchor)
+    turn = Rotation.from_quat(jnp.append(twist[:3] / 2, 1)).as_matrix()  # of small turns, and smooth at none
     place = pivot + turn @ (pose[:3, 3] - pivot) + twist[3:]
     return jnp.eye(4).at[:3, :3].set(turn @ pose[:3, :3]).at[:3, 3].set(place)
-
-
-def _rotation(vector: jax.Array) -> jax.Array:
-    """The rotation [3 3] by a vector [3] rad."""
-    return Rotation.from_rotvec(vector).as_matrix()
