@@ -150,7 +150,9 @@ def read_truth(
         )
     if surfaces is not None and surfaces.resting is not None and {"outcome", "variants"} & set(compared):
         points = surfaces.objects, surfaces.resting
-        outcome = know_outcome(folder, record, states, points, surfaces.names, "variants" in compared)
+        body, local = (np.concatenate([getattr(some, name) for some in points]) for name in ("body", "local"))
+        names = [surfaces.names[number] for number in body]
+        outcome = know_outcome(folder, record, states, names, local, "variants" in compared)
     return Truth(
         rgb=rgb[:frames],
         mask=states.robot_mask[:frames],

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import jax
 import numpy as np
@@ -29,18 +29,6 @@ OPEN = 0.8
 """Command of a gripper from which on it holds nothing."""
 UNJUDGED = ("grab_roller", "open_laptop", "place_dual_shoes", "place_mouse_pad", "press_stapler", "shake_bottle")
 """Tasks of which the judge says nothing, by the rule of docs/metrics.md."""
-
-
-class OnBodies(Protocol):
-    """Points on bodies (`xew.metrics.truth.Points`)."""
-
-    @property
-    def body(self) -> np.ndarray | None:
-        """[k] int, index of the body of each."""
-
-    @property
-    def local(self) -> np.ndarray | None:
-        """[k 3] places in the frames of their bodies [m]."""
 
 
 @dataclass(frozen=True)
@@ -182,14 +170,14 @@ class Outcome:
 
 
 def know_outcome(
-    folder: Path, record: Record, states: States, points: Sequence[OnBodies], names: Sequence[str], with_variants: bool
+    folder: Path, record: Record, states: States, body: Sequence[str], local: np.ndarray, with_variants: bool
 ) -> Outcome | None:
     """What a judge knows of an episode.
 
     Args:
         folder, record, states: of the episode.
-        points: points on its objects.
-        names: of the bodies that they lie on.
+        body: [k] names of the bodies that points on its objects lie on.
+        local: [k 3] places of these points in the frames of their bodies [m].
         with_variants: whether states under other variants of the commands are read.
 
     Returns:
@@ -205,10 +193,9 @@ def know_outcome(
     if scene is None or not _parts(scene):
         return None
     part_names = [scene.names[part.index] + " lid" * (part.hinge is not None) for part in _parts(scene)]
-    part_of_body = np.array([part_names.index(name) if name in part_names else -1 for name in names])
-    body, local = (np.concatenate([getattr(some, name) for some in points]) for name in ("body", "local"))
+    part = np.array([part_names.index(name) if name in part_names else -1 for name in body], int)
     variants = _read_variants(folder, record, states) if with_variants else ()
-    return Outcome(recorded_task(record.task), scene, states, local, part_of_body[body], variants)
+    return Outcome(recorded_task(record.task), scene, states, local, part, variants)
 
 
 def _parts(scene: "Scene") -> tuple[Part, ...]:
