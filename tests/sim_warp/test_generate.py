@@ -215,7 +215,7 @@ def test_a_full_disk_in_a_worker_is_one_line(
         (("--robots", "tests.sim_warp.small:CLOSE"), "is a Task; expected a RobotSpec"),
         (("--train-seeds", "-1"), "tasks, 5 robots, -1 training"),
         (("--batch", "0"), "a batch from 1"),
-        (("--faults", "99"), "error: --faults is 99; expected 2 to 30 commands a scene, or 0 for the expert's."),
+        (("--faults", "99"), "error: --faults is 99; expected 2 to 32 commands a scene, or 0 for the expert's."),
         (("--cameras", "wrist"), "error: there is no camera 'wrist'; did you mean 'wrist_left'?"),
         (("--cameras", "side", "--size", "640"), "error: the size is '640'; expected WIDTHxHEIGHT such as 640x480"),
         (("--cameras", "side", "--states-only"), "error: --cameras makes videos, and --states-only stores none"),

@@ -244,7 +244,7 @@ KINDS: tuple[tuple[str, str, Change, tuple[float, ...]], ...] = (
     ("close_late", "s", _of_a_grip(_close_late), (0.3, 0.45, 0.6)),
     ("stay_open", "", _of_a_grip(_stay_open), (1,)),
     ("open_early", "%", _of_a_grip(_open_early), (10, 30, 60)),
-    ("miss_target", "mm", _of_a_grip(_miss_target, released=True), (20, 40, 60)),
+    ("miss_target", "mm", _of_a_grip(_miss_target, released=True), (12, 16, 25, 40, 60)),
     ("swap_objects", "", _swap_objects, (1,)),
     ("low_lift", "%", _lift_low, (50, 80, 95)),
     ("stop", "%", _stop, (5, 10, 30, 60)),
