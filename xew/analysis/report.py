@@ -279,7 +279,8 @@ def ranking_tables(rows: pd.DataFrame, tables: Sequence[RobotTable]) -> list[Tab
         return []
     sections = []
     for group, own in ranking.groupby("robot", sort=False):
-        shown = tuple(_ranking_row(*key, of_model) for key, of_model in own.groupby(["model", "condition"], sort=False))
+        models = own.groupby(["model", "condition"], sort=False)
+        shown = tuple(_ranking_row(str(model), str(condition), of_model) for (model, condition), of_model in models)
         sections.append(TableSection(str(group), shown))
     caption = (
         f"Success rates of {ranking['policies'].max()} policies, the expert and its faults, in predicted video against their "
