@@ -37,7 +37,7 @@ GROUND = {"", "statistics", "video"}
 LAZILY = {
     ("model", "sim_warp"): ("conditions", "latents", "cache", "episodes", "devices.parts", "video"),
     ("model", "metrics"): ("codecs.ceiling", "conditions", "training.samples", "weights.reading"),
-    ("metrics", "sim_warp"): ("truth",),
+    ("metrics", "sim_warp"): ("truth", "outcome.judge"),
 }
 """Modules and packages of the first room that may import the second, and inside functions alone: the room loads without it."""
 FORBIDDEN = {
@@ -371,7 +371,7 @@ def test_the_registry_of_metrics_is_complete() -> None:
         if signature is None or signature.return_annotation not in (kinds.Scalar, kinds.ByFrame):
             continue
         compared = [parameter.annotation for parameter in signature.parameters.values()][:2]
-        if compared[0] == compared[1]:
+        if len(compared) == 2 and compared[0] == compared[1]:
             assert function in registered, f"{name} compares a prediction with its target, and METRICS does not have it"
 
 
@@ -379,7 +379,9 @@ def test_an_entry_of_the_registry_of_metrics_agrees_with_its_function() -> None:
     metrics = importlib.import_module("xew.metrics")
     kinds = importlib.import_module("xew.metrics.metric")
     masked = {kind: ["target_mask"] for kind in ("region", "robot", "bodies")}
-    others: dict[str, list[str]] = {"video": [], "mask": [], "track": ["valid"]} | masked
+    others: dict[str, list[str]] = (
+        {"track": ["valid"]} | {kind: [] for kind in ("video", "mask", "outcome", "variants")} | masked
+    )
     assert set(others) == set(kinds.INPUTS)
     for name, metric in metrics.METRICS.items():
         exported = metric.function.__name__
@@ -387,7 +389,7 @@ def test_an_entry_of_the_registry_of_metrics_agrees_with_its_function() -> None:
         taken = ["prediction", "target", *others[metric.inputs]]
         for function in filter(None, (metric.function, metric.curve, metric.parts)):
             assert list(inspect.signature(function).parameters)[: len(taken)] == taken, name
-        assert (metric.curve is None) == (metric.inputs == "track"), name
+        assert (metric.curve is None) == (metric.inputs in ("track", "variants")), name
         assert metric.range[0] < metric.range[1] and metric.dimension and metric.reference, name
         assert metric.suites and set(metric.suites) <= set(kinds.SUITES) and metric.points in kinds.POINTS, name
         options = inspect.signature(metric.function).parameters

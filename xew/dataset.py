@@ -17,7 +17,7 @@ from pathlib import Path
 from xew.episode import TEMPORARY, EpisodeError, Record, data_folder, exact_rate, read_record
 from xew.files import check_place
 from xew.names import check_name, folder_name
-from xew.protocol import HEAD, MOTIONS, RANDOM_CHANGE, seed_split
+from xew.protocol import HEAD, MOTIONS, RANDOM_CHANGE, seed_split, split_fault
 
 Episode = tuple[Path, Record]
 """Folder and header of one cell."""
@@ -133,6 +133,11 @@ def find_records(data: Path) -> Iterator[Episode]:
 def find_accepted(data: Path) -> list[Episode]:
     """`Dataset.accepted` of a data set."""
     return list(read_dataset(data).accepted)
+
+
+def holds_faults(data: Path) -> bool:
+    """Whether a data set holds episodes of faulty commands, by the names of its folders."""
+    return any(path.name.isdecimal() and split_fault(int(path.name))[0] for path in Path(data).glob("*/*"))
 
 
 def demand_motion(data: Path, records: Iterable[Record], motion: str) -> None:

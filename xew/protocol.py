@@ -30,6 +30,7 @@ DIMENSION_TITLES = {
     "morphology": "Robot morphology",
     "kinematics": "Robot kinematics",
     "objects": "Object dynamics",
+    "outcome": "Task outcome",
 }
 """Titles of the dimensions, the groups of metrics, which are never combined into one number."""
 

@@ -37,6 +37,7 @@ from xew.metrics.backends import Masker, Tracker, open_masker, open_tracker
 from xew.metrics.episode_cache import EpisodeCache
 from xew.metrics.grade import Comparison, Grades, grade, input_kind
 from xew.metrics.grading.codecs import ModelCodec, open_codecs
+from xew.metrics.grading.settings import WITHOUT_OUTCOME
 from xew.metrics.truth import NEEDS, Truth, read_truth
 from xew.protocol import seed_split
 
@@ -80,7 +81,7 @@ class Args:
     """Its weights, where it has some."""
     predictors: bool = False
     """Grade predictors made on purpose, instead of both tables."""
-    metrics: tuple[str, ...] = tuple(METRICS)
+    metrics: tuple[str, ...] = WITHOUT_OUTCOME
     """Names of the metrics of the predictors' table."""
     cases: tuple[str, ...] = tuple(PREDICTORS)
     """Names of the predictors that are graded."""
@@ -162,7 +163,7 @@ def calibrate(
     wrong: list[Row] = []
     frames: list[pd.DataFrame] = []
     for case, video in reference_videos(episodes, episode, truth, codec):
-        values = estimators.grade(video, truth, tuple(METRICS)).values
+        values = estimators.grade(video, truth, _graded()).values
         references += [key | {"case": case, "metric": name, "value": value} for name, value in values.items()]
     for case, wrong_motion in render_perturbations(folder):
         grades, true = estimators.grade(wrong_motion.rgb, truth, ESTIMATED), true_grades(wrong_motion, truth)
@@ -285,7 +286,12 @@ def report(references: pd.DataFrame, wrong: pd.DataFrame, frames: pd.DataFrame) 
 def reference_table(references: pd.DataFrame) -> pd.DataFrame:
     """Mean of each metric (rows) on each reference (columns); both in their own order."""
     table = references.groupby(["metric", "case"])["value"].mean().unstack()
-    return table.loc[list(METRICS), list(references["case"].unique())].map("{:.3f}".format)
+    return table.loc[list(_graded()), list(references["case"].unique())].map("{:.3f}".format)
+
+
+def _graded() -> tuple[str, ...]:
+    """Names of metrics of references; those of outcomes have a calibration of their own (outcome.py)."""
+    return tuple(name for name in METRICS if name in WITHOUT_OUTCOME)
 
 
 def appearance_table(rows: pd.DataFrame) -> pd.DataFrame:

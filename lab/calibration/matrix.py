@@ -18,6 +18,7 @@ from xew.metrics import METRICS
 from xew.metrics.backends import Masker, Tracker
 from xew.metrics.episode_cache import EpisodeCache
 from xew.metrics.grade import Comparison, grade, input_kind
+from xew.metrics.grading.settings import WITHOUT_OUTCOME
 from xew.metrics.truth import Truth, read_truth
 
 STEPS: tuple[tuple[str, ...], ...] = (
@@ -78,7 +79,7 @@ def grade_predictors(
     other: Path | None,
     masker: Masker,
     tracker: Tracker,
-    metrics: Sequence[str] = tuple(METRICS),
+    metrics: Sequence[str] = WITHOUT_OUTCOME,
     cases: Sequence[str] = tuple(PREDICTORS),
 ) -> list[Row]:
     """Rows of one episode: the value of each metric for each predictor, NaN where it has none.
@@ -103,7 +104,7 @@ def grade_material(
     truth: Truth,
     masker: Masker,
     tracker: Tracker,
-    metrics: Sequence[str] = tuple(METRICS),
+    metrics: Sequence[str] = WITHOUT_OUTCOME,
     cases: Sequence[str] = tuple(PREDICTORS),
 ) -> list[Row]:
     """Rows (case metric value) of all predictors that can be made of the material; the truth is graded as by `evaluate`."""

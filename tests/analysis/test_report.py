@@ -15,14 +15,16 @@ from matplotlib.figure import Figure
 
 from tests.analysis.conftest import FRAMES, SEEDS, TASKS, Study
 from tests.analysis.reports.browser import find_faults, needs_chromium
-from xew.analysis.report import Args, Picture, _strip_section, _write_explorer, main, run_table
+from xew.analysis.report import Args, Picture, _strip_section, _write_explorer, main, ranking_tables, run_table
 from xew.analysis.reports import charts
 from xew.analysis.reports.run_tables import Interval, RobotTable, Row
 from xew.analysis.reports.study_charts import run_chart
 from xew.analysis.scores import MetricInfo, read_scores
+from xew.analysis.tables import formats
 from xew.config import ConfigError
 from xew.episode import write_video
 from xew.metrics import evaluate
+from xew.protocol import join_fault
 from xew.rollout import find_rollouts, read_rollout_video
 
 VOID = {"meta", "img", "br", "hr", "link", "input"}
@@ -311,3 +313,16 @@ def test_a_gain_over_almost_nothing_is_written_on_a_bar_that_ends() -> None:
     charts.bars(axes, ["render", "over almost nothing"], [("C0", values, np.full(2, np.nan))], "better by [%]")
     assert [text.get_text() for text in axes.texts] == ["80,600"]
     assert charts.LONGEST_BAR < axes.get_xlim()[1] < 1.1 * charts.LONGEST_BAR
+
+
+def test_policies_are_ranked_in_a_table_of_their_own() -> None:
+    rows = []
+    for fault, seed in ((fault, seed) for fault in (0, 1) for seed in range(3)):
+        key = {"model": "mine", "condition": "flow", "task": "t", "seed": join_fault(fault, seed), "robot": "piper"}
+        rows += [key | {"metric": "outcome_accuracy", "value": 1.0}]
+        rows += [key | {"metric": "hallucinated_success", "value": 0.0}] if fault else []
+    table = RobotTable("Piper", ("piper",), (), None)
+    [ranking] = ranking_tables(pd.DataFrame(rows), [table])
+    assert [section.title for section in ranking.sections] == ["Piper"] and "2 policies" in ranking.caption
+    assert "| mine · flow | 1.000 | 1.000 | 0.000 |" in formats.markdown(ranking)
+    assert ranking_tables(pd.DataFrame(rows[:3]), [table]) == [], "the expert alone"

@@ -41,7 +41,8 @@ WILD_TRACKS = {
     "one lost": lambda points: np.where(np.arange(len(points))[:, None, None] == 1, np.float32(np.nan), points),
     "at the corner": np.zeros_like,
 }
-WILD = {"mask": WILD_MASKS, "track": WILD_TRACKS}
+WILD_NUMBERS = {"none": np.zeros_like, "all": np.ones_like, "inverse": lambda numbers: 1 - numbers}
+WILD = {"mask": WILD_MASKS, "track": WILD_TRACKS, "outcome": WILD_NUMBERS, "variants": WILD_NUMBERS}
 """What a prediction can be at worst, by kind of input; else WILD_VIDEOS."""
 WILD_CASES = [(name, case) for name, metric in METRICS.items() for case in WILD.get(metric.inputs, WILD_VIDEOS)]
 
@@ -50,6 +51,8 @@ def inputs(kind: str) -> tuple[np.ndarray, ...]:
     masks = rng.random((2, T, H, W)) < 0.5
     if kind == "mask":
         return tuple(masks)
+    if kind in ("outcome", "variants"):
+        return rng.random(T, np.float32), np.float32([1, 0, 0.5])
     if kind == "track":
         target = rng.uniform(0, 40, (T, K, 2)).astype(np.float32)
         return (target + rng.normal(0, 3, target.shape)).astype(np.float32), target, rng.random((T, K)) < 0.9

@@ -29,6 +29,8 @@ def inputs(kind: str) -> tuple[np.ndarray, ...]:
     """All frames, the first of them exact."""
     if kind == "mask":
         return masks(), masks()
+    if kind in ("outcome", "variants"):
+        return rng.random(FRAMES, np.float32), rng.random(FRAMES, np.float32)
     if kind == "track":
         target = rng.uniform(0, 60, (FRAMES, 3, 2)).astype(np.float32)
         prediction = (target + rng.normal(0, 4, target.shape)).astype(np.float32)

@@ -28,6 +28,8 @@ def inputs(kind: str, dtype: type = np.float32) -> Arrays:
     masks[0, :, :9] = False
     if kind == "mask":
         return tuple(masks)
+    if kind in ("outcome", "variants"):
+        return tuple(rng.random((2, T)).astype(dtype))
     if kind == "track":
         target = rng.uniform(0, SIDE, (T, K, 2)).astype(dtype)
         return (target + rng.uniform(0, 3, target.shape)).astype(dtype), target, np.ones((T, K), bool)
@@ -134,7 +136,8 @@ def test_nan_goes_through(name: str) -> None:
     """One channel of the last pixel, which no window of LPIPS reaches; of tracks, a true point that ought to be visible."""
     metric, kind = METRICS[name], METRICS[name].inputs
     arrays = inputs(kind)
-    arrays[1 if kind == "track" else 0][(1, 1, 0) if kind == "track" else (1, -1, -1, 2)] = np.nan
+    place = {"track": (1, 1, 0), "outcome": (1,), "variants": (1,)}.get(kind, (1, -1, -1, 2))
+    arrays[1 if kind == "track" else 0][place] = np.nan
     assert np.isnan(np.mean(metric.function(*arrays)))
     assert name == "trajectory_error" or np.isnan(metric.total(*arrays).mean)
     if metric.curve is not None:

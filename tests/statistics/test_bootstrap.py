@@ -5,6 +5,7 @@ import pandas as pd
 import pytest
 from scipy import stats
 
+from xew.protocol import join_fault
 from xew.statistics import DRAWS, MIN_SCENES, fixed_mean
 from xew.statistics.bootstrap import Units, bootstrap_means, draw_units, find_strata
 from xew.statistics.correlation import every_draw
@@ -44,6 +45,13 @@ def test_rows_of_a_unit_are_drawn_together() -> None:
     assert ends(copies, np.repeat(np.arange(12), 10)) == pytest.approx(once, abs=1e-12)
     alone = ends(copies, np.arange(120))
     assert np.ptp(alone) < 0.5 * np.ptp(once)
+
+
+def test_all_commands_in_a_scene_are_drawn_with_it() -> None:
+    seeds = [join_fault(fault, base) for base in (4, 7) for fault in (0, 1, 2)]
+    rows = pd.DataFrame({"task": "a", "seed": seeds})
+    units = Units(rows)
+    assert len(units) == 2 and units.numbers(pd.MultiIndex.from_frame(rows)).tolist() == [0, 0, 0, 1, 1, 1]
 
 
 def test_missing_values_are_left_out_and_few_units_have_no_interval() -> None:

@@ -42,6 +42,7 @@ from xew.analysis.scores import TRUTH, MetricInfo, Scores, find_missing_scores, 
 from xew.analysis.tables import formats
 from xew.analysis.tables.labels import robot_title
 from xew.analysis.tables.table import (
+    Column,
     Table,
     TableCell,
     TableRow,
@@ -58,9 +59,10 @@ from xew.files import hold_lock, write_bytes, write_text
 from xew.names import csv_text, plain_markdown
 from xew.protocol import BASELINES, HELD_OUT_ROBOTS, ROBOT_NAMES, seed_split
 from xew.rollout import Rollout, find_rollouts, read_as_graded
-from xew.statistics import MIN_SCENES, find_parting, strict_metrics
+from xew.statistics import MIN_SCENES, find_parting, rank_policies, strict_metrics
 
 TITLE = "Can the model render a robot that it has never seen?"
+RANKING = "Policies ranked in predicted video"
 STRIP_METRIC = "lpips"
 """Metric that ranks episodes, so strips show the best, the median and the worst."""
 FRAME_ZERO = {
@@ -198,19 +200,21 @@ def _report_scores(args: Args, scores: Scores) -> None:
     if args.explorer:
         _write_explorer(scores, args)
     curves = _curve_chart(scores, args.held_out)
+    ranking = ranking_tables(scores.rows, held_out + seen)
     sections = [
         *map(page.note, notes),
         _held_out_section(held_out, scores.metrics),
         _strip_section(strips, args),
         page.section("How the error grows with time", page.chart(curves)) if curves.panels else None,
         _seen_section(seen, scores.metrics),
+        _ranking_section(ranking),
         _method_section(scores, args),
     ]
     sentences = finding(held_out, seen, scores.metrics)
     html = page.page(TITLE, sentences, [part for part in sections if part], _format_footer(scores.versions), first)
     notes += _caution_notes(held_out)
     drawn = chart_files(curves) | (chart_files(first.chart) if first.chart else {})
-    text, files = _write_markdown([first.sentence, *sentences], notes, held_out, seen, scores, strips, drawn)
+    text, files = _write_markdown([first.sentence, *sentences], notes, held_out, seen, scores, strips, drawn, ranking)
     if len(missing):
         files["missing.csv"] = csv_text(missing).encode()
     _write_report(args.out, html, (text, files), flat_summary(held_out + seen, scores.metrics))
@@ -266,6 +270,43 @@ def _seen_section(tables: Sequence[RobotTable], metrics: Sequence[MetricInfo]) -
         return None
     text = "The same model on its training robots, at test seeds."
     return page.section("Robots seen in training", page.paragraph(text), *(page.table(run_table(t, metrics)) for t in tables))
+
+
+def ranking_tables(rows: pd.DataFrame, tables: Sequence[RobotTable]) -> list[Table]:
+    """A table of policy ranking with a section for each table of robots; none where no scene has several commands."""
+    ranking = rank_policies(rows, {table.title: table.robots for table in tables})
+    if ranking.empty:
+        return []
+    sections = []
+    for group, own in ranking.groupby("robot", sort=False):
+        models = own.groupby(["model", "condition"], sort=False)
+        shown = tuple(_ranking_row(str(model), str(condition), of_model) for (model, condition), of_model in models)
+        sections.append(TableSection(str(group), shown))
+    caption = (
+        f"Success rates of {ranking['policies'].max()} policies, the expert and its faults, in predicted video against their "
+        "rates in the simulator; 95 % intervals over scenes."
+    )
+    columns = tuple(map(Column, ("Pearson's r", "Spearman", "MMRV")))
+    return [Table("policy_ranking", RANKING, caption, ("model",), columns, tuple(sections))]
+
+
+def _ranking_row(model: str, condition: str, measures: pd.DataFrame) -> TableRow:
+    cells = (
+        TableCell(
+            f"{value:.3f}",
+            "" if np.isnan(low) else f"[{low:.3f}, {high:.3f}]",
+            value=value,
+            low=low,
+            high=high,
+            episodes=scenes,
+        )
+        for value, low, high, scenes in measures[["value", "low", "high", "scenes"]].itertuples(index=False)
+    )
+    return TableRow((" · ".join(filter(None, (BASELINES.get(model, model), condition))),), tuple(cells), model in BASELINES)
+
+
+def _ranking_section(tables: Sequence[Table]) -> Markup | None:
+    return page.section(RANKING, *map(page.table, tables)) if tables else None
 
 
 def run_table(table: RobotTable, metrics: Sequence[MetricInfo]) -> Table:
@@ -428,12 +469,14 @@ def _write_markdown(
     scores: Scores,
     figures: Sequence[Picture],
     charts: Mapping[str, bytes],
+    ranking: Sequence[Table],
 ) -> tuple[str, dict[str, bytes]]:
     bullets = [f"- {plain_markdown(sentence)}" for sentence in sentences]
     lines = [f"# {TITLE}", "", *bullets, *(f"\n> {plain_markdown(note)}" for note in notes)]
     made: list[Table] = []
-    for heading, tables in (("Robots never seen in training", held_out), ("Robots seen in training", seen)):
-        shown = [run_table(table, scores.metrics) for table in tables]
+    groups = {"Robots never seen in training": held_out, "Robots seen in training": seen}
+    sections = {heading: [run_table(table, scores.metrics) for table in tables] for heading, tables in groups.items()}
+    for heading, shown in (sections | ({RANKING: [*ranking]} if ranking else {})).items():
         lines += ["", f"## {heading}"]
         lines += [line for t in shown for line in ("", f"### {t.title}", "", t.caption, "", formats.markdown(t))]
         made += shown

@@ -28,6 +28,16 @@ from xew.metrics.motion import (
     onset_shift,
     onset_shifts,
 )
+from xew.metrics.outcome.measures import (
+    counterfactual_retrieval,
+    hallucinated_success,
+    hallucinated_success_frames,
+    hallucinated_success_parts,
+    outcome_accuracy,
+    progress_error,
+    retrieval,
+    retrieval_parts,
+)
 from xew.metrics.perceptual import (
     lpips,
     lpips_embedding,
@@ -58,6 +68,7 @@ from xew.metrics.track import (
     trajectory_error_strict,
     warpings,
 )
+from xew.statistics import mean_max_rank_violation, policy_ranking
 
 INF = math.inf
 PAPER, STRICT = ("paper",), ("strict",)
@@ -158,6 +169,20 @@ METRICS = {
     "object_coverage_strict": Metric(
         coverage, None, "objects", "", (0, 1), True, "track", "share of visible points on objects that were found",
         "Object points found", reported=False, parts=presence, suites=STRICT, counterpart="object_coverage", points="surfaces"),
+    "outcome_accuracy": Metric(
+        outcome_accuracy, outcome_accuracy, "outcome", "", (0, 1), True, "outcome",
+        "whether judged success agrees with the simulator's, at the last frame", "Outcome accuracy", suites=STRICT),
+    "progress_error": Metric(
+        progress_error, progress_error, "outcome", "", (0, 1), False, "outcome",
+        "difference of the judged progress from the simulator's, at the last frame", "Progress error", suites=STRICT),
+    "hallucinated_success": Metric(
+        hallucinated_success, hallucinated_success_frames, "outcome", "", (0, 1), False, "outcome",
+        "whether a video shows success where the simulator fails", "Hallucinated success",
+        parts=hallucinated_success_parts, suites=STRICT),
+    "retrieval": Metric(
+        retrieval, None, "outcome", "", (0, 1), True, "variants",
+        "whether objects move as under these commands rather than under other commands in the same scene; chance is 1/k",
+        "Counterfactual retrieval", parts=retrieval_parts, suites=STRICT),
 }  # fmt: skip
 """All metrics by name, in the order of the paper's dimensions."""
 
@@ -165,6 +190,7 @@ __all__ = [
     "METRICS",
     "Metric",
     "boundary_f1",
+    "counterfactual_retrieval",
     "coverage",
     "exact_frames",
     "final_object_error",
@@ -173,20 +199,26 @@ __all__ = [
     "found_error",
     "ghosts",
     "gripper_error",
+    "hallucinated_success",
     "keypoint_error",
     "keypoint_error_strict",
     "lpips",
     "lpips_embedding",
     "mask_iou",
+    "mean_max_rank_violation",
     "ndtw",
     "ndtw_strict",
     "onset_shift",
+    "outcome_accuracy",
     "pck",
     "pck_05",
     "pck_strict",
+    "policy_ranking",
+    "progress_error",
     "psnr",
     "region_lpips",
     "region_lpips_frames",
+    "retrieval",
     "robot_lpips",
     "robot_lpips_frames",
     "ssim",

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 from xew.metrics.estimators.appearance import TrueAppearance
-from xew.metrics.metric import ACCELERATOR_CHUNK
+from xew.metrics.metric import ACCELERATOR_CHUNK, fill_up
 from xew.metrics.perceptual import KEPT_FEATURES, SharedFeatures
 from xew.metrics.truth import Truth
 
@@ -72,10 +72,3 @@ def cut_blocks(array: np.ndarray, whole: bool = False) -> list[np.ndarray]:
     size = FRAME_BLOCK if is_on_cpu() else ACCELERATOR_CHUNK
     blocks = [array[start : start + size] for start in range(0, len(array), size)]
     return [*blocks[:-1], fill_up(blocks[-1], 0, size)]
-
-
-def fill_up(array: np.ndarray, axis: int, multiple: int, value: int | None = None) -> np.ndarray:
-    """An array [...] longer along an axis, up to a multiple, by a value or, left out, by what is last."""
-    missing = -array.shape[axis] % multiple
-    widths = [(0, missing if i == axis else 0) for i in range(array.ndim)]
-    return np.pad(array, widths, mode="edge") if value is None else np.pad(array, widths, constant_values=value)

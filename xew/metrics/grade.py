@@ -16,9 +16,10 @@ import numpy as np
 
 from xew.metrics import METRICS
 from xew.metrics.backends import Masker, Tracker
-from xew.metrics.episode_cache import EpisodeCache, GradedVideo, cut_blocks, fill_up, is_on_cpu
+from xew.metrics.episode_cache import EpisodeCache, GradedVideo, cut_blocks, is_on_cpu
 from xew.metrics.estimators.appearance import REST as SCENE
 from xew.metrics.estimators.presence import confirm_tracks
+from xew.metrics.metric import fill_up
 from xew.metrics.perceptual import SMALLEST_SIDE, Box, lpips, region_lpips_frames, robot_lpips_frames, union_box
 from xew.metrics.truth import Points, Truth
 
@@ -27,6 +28,8 @@ TRACK_BLOCK, POINT_BLOCK = 64, 32
 programs: compiling one takes seconds, running it milliseconds."""
 ON_SURFACES = ("robot_points", "object_points")
 """Kinds of points that are tracked in one pass, by any tracker."""
+JUDGED = ("outcome", "variants")
+"""Kinds of inputs that rest on a judge, who asks for points on objects."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +102,17 @@ class Comparison:
         }
         if truth.surfaces is not None:
             known |= {"robot_points": truth.surfaces.robot, "object_points": truth.surfaces.objects}
+            if truth.outcome is not None and truth.surfaces.resting is not None:
+                known |= {"resting_points": truth.surfaces.resting}
         return known
+
+    @cached_property
+    def judged_poses(self) -> np.ndarray:
+        """Poses [t p 4 4] of the parts of `Truth.outcome` in the prediction. The truth was read with its outcome."""
+        assert self.truth.outcome is not None, "asked for by read_truth"
+        kinds = ("object_points", "resting_points")
+        tracks = np.concatenate([self.track(kind) for kind in kinds], axis=1)
+        return self.truth.outcome.poses(tracks, np.concatenate([self.points[kind].visible for kind in kinds], axis=1))
 
     def estimate_masks(self) -> np.ndarray:
         """Robot masks [t h w] bool of all frames of the prediction."""
@@ -169,6 +182,8 @@ def grade(comparison: Comparison, metrics: Collection[str]) -> Grades:
         elif name in of_tracks:
             values[name], curve = of_tracks[name]
             curves |= {} if curve is None else {name: curve}
+        elif METRICS[name].curve is None:
+            values[name] = float(METRICS[name].function(*arrays))
         else:
             curves[name] = of_features[name] if name in of_features else _curve(comparison, name, arrays)
             values[name] = _mean_of_known(curves[name])
@@ -222,12 +237,31 @@ def _tracks(kind: str, c: Comparison) -> Arrays | None:
     return (tracks[first:, seen], pixels[:, seen], visible[:, seen]) if seen.any() else None
 
 
+def _outcome(c: Comparison) -> Arrays | None:
+    """Judged and true progress [1] in the last frame; None where there is no judge of the episode."""
+    outcome, last = c.truth.outcome, len(c.prediction) - 1
+    if outcome is None or not outcome.is_judged:
+        return None
+    judged, true = outcome.progress(c.judged_poses[last], last), outcome.true_progress(last)
+    return np.array([judged], np.float32), np.array([true], np.float32)
+
+
+def _variants(c: Comparison) -> Arrays | None:
+    """Distances [k] of objects from where they are under k variants of the commands, of the prediction and of its truth."""
+    outcome, frames = c.truth.outcome, slice(c.episode.first, len(c.prediction))
+    if outcome is None or not outcome.is_judged or not outcome.variants:
+        return None
+    return tuple(outcome.distances(poses, frames) for poses in (c.judged_poses, outcome.true_poses(len(c.prediction))))
+
+
 INPUTS: dict[str, Callable[[Comparison], Arrays | None]] = {
     "video": _video,
     "mask": _mask,
     "region": _region,
     "robot": _robot,
     "bodies": _bodies,
+    "outcome": _outcome,
+    "variants": _variants,
     **{kind: functools.partial(_tracks, kind) for kind in ("keypoints", "objects", *ON_SURFACES)},
 }
 """Arrays that the functions of metrics take, by `input_kind`; None where the truth has nothing to compare."""
@@ -237,7 +271,7 @@ def _curve(comparison: Comparison, name: str, arrays: Arrays) -> np.ndarray:
     """[t] float32, the values by frame of a metric of frames."""
     metric = METRICS[name]
     assert metric.curve is not None, "metrics of frames have one"
-    if metric.inputs == "mask":
+    if metric.inputs in ("mask", "outcome"):
         blocks = [cut_blocks(array, metric.whole) for array in arrays]
     else:
         blocks = _video_blocks(comparison, arrays, metric.whole)

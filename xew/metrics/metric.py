@@ -32,12 +32,15 @@ Scalar: TypeAlias = Float32[jax.Array, ""]
 P = ParamSpec("P")
 R = TypeVar("R")
 
-INPUTS = ("video", "mask", "region", "robot", "bodies", "track")
+INPUTS = ("video", "mask", "region", "robot", "bodies", "track", "outcome", "variants")
 """Kinds of what a metric compares. video: two [t h w 3]. mask: two [t h w]. region: two videos and the union over time of the
 target's masks. robot: two videos and the target's masks frame by frame. bodies: the same with masks of the robot and all
-objects. track: two [t k 2], valid [t k]."""
-ESTIMATED_INPUTS = ("mask", "track")
+objects. track: two [t k 2], valid [t k]. outcome: two [t], the task's progress. variants: two [k], distances
+from what happens under k variants of the commands."""
+ESTIMATED_INPUTS = ("mask", "track", "outcome", "variants")
 """Inputs that have to be estimated in a prediction."""
+OUTCOME = "outcome"
+"""The dimension of metrics of what commands cause. Its judge leaves out tasks itself (`outcome.judge.UNJUDGED`)."""
 SUITES = {
     "paper": "the paper's definitions, so its tables compare with ours",
     "strict": "what is lost is an error, points lie on surfaces, and one tolerance holds for all robots",
@@ -137,7 +140,7 @@ class Metric:
     @property
     def leaves_tasks(self) -> bool:
         """Do tasks without power leave its mean (`xew.statistics.find_power`)?"""
-        return self.estimated and "strict" in self.suites
+        return self.estimated and "strict" in self.suites and self.dimension != OUTCOME
 
     def total(self, *inputs: AnyArray, **options: Any) -> Total:
         """Sum and number of the values that the metric averages; totals of parts of a video, or of several videos, add up.
@@ -321,3 +324,10 @@ def map_chunks(function: Callable[..., Any], frames: Any, chunk: int | None) -> 
 
     values = lax.map(of_chunk, order)
     return jax.tree.map(lambda leaf: leaf.reshape(chunks * size, *leaf.shape[2:])[:count], values)
+
+
+def fill_up(array: np.ndarray, axis: int, multiple: int, value: float | None = None) -> np.ndarray:
+    """An array [...] longer along an axis, up to a multiple, by a value or, left out, by what is last."""
+    missing = -array.shape[axis] % multiple
+    widths = [(0, missing if i == axis else 0) for i in range(array.ndim)]
+    return np.pad(array, widths, mode="edge") if value is None else np.pad(array, widths, constant_values=value)

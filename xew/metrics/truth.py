@@ -12,7 +12,9 @@ import numpy as np
 
 from xew.episode import EpisodeError, Record, demand_known, project, read_pixels, read_record, read_states
 from xew.metrics.estimators.appearance import REST as SCENE
+from xew.metrics.outcome.judge import Outcome, know_outcome
 
+OUTCOME_NEEDS = ("action", "tool_pose", "object_pose", "object_joint", "contact", "extrinsics", "intrinsics")
 NEEDS = {
     "video": (),
     "mask": ("robot_mask",),
@@ -23,6 +25,8 @@ NEEDS = {
     "objects": ("object_pose", "extrinsics", "intrinsics"),
     "robot_points": ("keypoints", "keypoint_visible"),
     "object_points": ("object_pose", "extrinsics", "intrinsics"),
+    "outcome": OUTCOME_NEEDS,
+    "variants": OUTCOME_NEEDS,
 }
 """Arrays of an episode that each kind of comparison rests on; imported episodes may not know some."""
 
@@ -52,6 +56,8 @@ class Points:
     """[k] int, index of the body that each point lies on, as in `Surfaces.body_id`; None where bodies are not known."""
     finger: np.ndarray | None = None
     """[k] int, the finger of each point: 0 and 1 of the left hand, 2 and 3 of the right, else -1; None if not known."""
+    local: np.ndarray | None = None
+    """[k 3] float32, place of each point in the frame of its body [m]; None where bodies are not known."""
 
 
 @dataclass(frozen=True)
@@ -65,6 +71,10 @@ class Surfaces:
     known: bool
     """False where the episode's shapes are not known, as of an imported one: the points are then links' and objects'
     origins."""
+    resting: Points | None = None
+    """Points on objects and lids that do not move; None where the shapes are not known."""
+    names: tuple[str, ...] = ()
+    """Names of the bodies of known shapes, in the order of their indices."""
 
 
 @dataclass(frozen=True)
@@ -86,6 +96,8 @@ class Truth:
     A moving object that is behind another counts as visible: episodes hold no depth."""
     surfaces: Surfaces | None = None
     """Points on surfaces; None where they were not asked for."""
+    outcome: Outcome | None = None
+    """Knowledge of a judge of the outcome; None where it was not asked for or is not known."""
 
     @cached_property
     def labels(self) -> np.ndarray:
@@ -128,7 +140,7 @@ def read_truth(
         raise EpisodeError(f"{folder}: video {rgb.shape[:3]} and masks {states.robot_mask.shape} differ; generate it again.")
     objects = project(states.object_pose[..., :3], states.intrinsics, states.extrinsics)[0].astype(np.float32)
     visible = _find_visible(objects, rgb, states.robot_mask)
-    surfaces = None
+    surfaces = outcome = None
     if WITH_SURFACES & set(compared):
         surfaces = _find_surfaces(folder, frames, cache) or Surfaces(
             Points(states.keypoints[:frames], states.keypoint_visible[:frames]),
@@ -136,6 +148,11 @@ def read_truth(
             body_id=None,
             known=False,
         )
+    if surfaces is not None and surfaces.resting is not None and {"outcome", "variants"} & set(compared):
+        points = surfaces.objects, surfaces.resting
+        body, local = (np.concatenate([getattr(some, name) for some in points]) for name in ("body", "local"))
+        names = [surfaces.names[number] for number in body]
+        outcome = know_outcome(folder, record, states, names, local, "variants" in compared)
     return Truth(
         rgb=rgb[:frames],
         mask=states.robot_mask[:frames],
@@ -144,6 +161,7 @@ def read_truth(
         objects=objects[:frames],
         object_visible=visible[:frames],
         surfaces=surfaces,
+        outcome=outcome,
     )
 
 
@@ -157,11 +175,17 @@ def _find_surfaces(folder: Path, frames: int, cache: Path | None) -> Surfaces | 
     finger = find_fingers(folder, tracks.names)
     of_robot = tracks.is_robot[tracks.body]
     moves = (tracks.displacement[:frames].max(axis=0) > MOVED)[tracks.body]
-    robot, objects = (
-        Points(tracks.pixels[:frames, some], tracks.visible[:frames, some], tracks.body[some], finger[tracks.body[some]])
-        for some in (of_robot, ~of_robot & moves)
+    robot, objects, resting = (
+        Points(
+            tracks.pixels[:frames, some],
+            tracks.visible[:frames, some],
+            tracks.body[some],
+            finger[tracks.body[some]],
+            tracks.local[some],
+        )
+        for some in (of_robot, ~of_robot & moves, ~of_robot & ~moves)
     )
-    return Surfaces(robot, objects, tracks.shown[:frames], known=True)
+    return Surfaces(robot, objects, tracks.shown[:frames], True, resting, tracks.names)
 
 
 def _of_moving(places: np.ndarray, points: Points, frames: int) -> Points:

@@ -11,6 +11,7 @@ The package stands on the ground: it imports NumPy, SciPy and pandas, and nothin
     verdicts.py    noise floors, and better, worse or unresolved
     suites.py      which of two suites' metrics decides, and where they part
     power.py       which tasks say nothing about a metric, and leave its mean
+    ranking.py     are policies ranked in predicted video as in the simulator
     summary.py     means of a table by group of robots, and differences between its models
 """
 
@@ -19,6 +20,7 @@ from xew.statistics.correlation import every_draw, exact_p, interval_of_r, parti
 from xew.statistics.inference import DRAWS, LEVEL, SIGNIFICANCE, Component, Drawn, holm
 from xew.statistics.means import MIN_SCENES, Mean, Part, combine, fixed_mean, pool_runs
 from xew.statistics.power import describe_power, find_power
+from xew.statistics.ranking import mean_max_rank_violation, policy_ranking, rank_policies
 from xew.statistics.runs import ASSUMED_SPREAD, RunSpread, find_spread
 from xew.statistics.suites import describe_parting, find_parting, strict_metrics
 from xew.statistics.summary import Summary, measure_power, summarize
@@ -64,12 +66,15 @@ __all__ = [
     "holm",
     "interval_of_r",
     "largest_floor",
+    "mean_max_rank_violation",
     "measure_power",
     "noise_floor",
     "partial_r",
     "pearson",
     "permutation_p",
+    "policy_ranking",
     "pool_runs",
+    "rank_policies",
     "strict_metrics",
     "summarize",
     "verdict",

@@ -15,6 +15,7 @@ from functools import lru_cache
 import numpy as np
 import pandas as pd
 
+from xew.protocol import FAULT_STRIDE
 from xew.statistics.inference import DRAWS, SEED
 from xew.statistics.means import Mean, fixed_mean
 
@@ -34,7 +35,7 @@ class Units:
     def __init__(self, rows: pd.DataFrame, kind: str = "scene") -> None:
         self.kind = kind
         self._names = list(UNITS[kind])
-        self._keys = pd.MultiIndex.from_frame(rows[self._names].drop_duplicates().sort_values(self._names))
+        self._keys = pd.MultiIndex.from_frame(self._units(rows).drop_duplicates().sort_values(self._names))
         tasks = self._keys.get_level_values("task").to_list() if kind == "scene" else [""] * len(self._keys)
         self.strata = find_strata(tasks)
 
@@ -43,7 +44,12 @@ class Units:
 
     def numbers(self, index: pd.MultiIndex) -> np.ndarray:
         """[n] int, the number of the unit of each row of a table's index, which has the levels task and seed."""
-        return self._keys.get_indexer(pd.MultiIndex.from_frame(index.to_frame(index=False)[self._names]))
+        return self._keys.get_indexer(pd.MultiIndex.from_frame(self._units(index.to_frame(index=False))))
+
+    def _units(self, rows: pd.DataFrame) -> pd.DataFrame:
+        """The names of the units of rows: all commands in a scene, faulty ones too, are drawn with their scene."""
+        units = rows[self._names]
+        return units.assign(seed=units["seed"] % FAULT_STRIDE) if "seed" in units else units
 
 
 def find_strata(tasks: Sequence[str]) -> tuple[int, ...]:

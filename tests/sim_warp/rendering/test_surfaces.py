@@ -163,6 +163,7 @@ def test_a_body_of_which_few_candidates_are_free_gets_points(
     kept = len(plain.body)
     assert (filled.body[kept:] == filled.names.index("plate")).all() and len(filled.body) < kept + 2 * AIM_OF_THING
     cut = {"pixels": filled.pixels[:, :kept], "visible": filled.visible[:, :kept], "body": filled.body[:kept]}
+    cut |= {"local": filled.local[:kept]}
     assert_same(replace(filled, **cut), plain)
     x, y = np.round(filled.pixels[filled.visible]).astype(int).T
     frame, point = np.nonzero(filled.visible)

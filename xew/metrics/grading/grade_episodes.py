@@ -14,7 +14,7 @@ import numpy as np
 from xew.episode import EpisodeError, read_record
 from xew.metrics.backends import Masker, Tracker
 from xew.metrics.episode_cache import EpisodeCache
-from xew.metrics.grade import ON_SURFACES, Comparison, Grades, grade, input_kind
+from xew.metrics.grade import JUDGED, ON_SURFACES, Comparison, Grades, grade, input_kind
 from xew.metrics.grading.baselines import BASELINES
 from xew.metrics.grading.codecs import ModelCodec
 from xew.metrics.grading.list_jobs import Job
@@ -96,7 +96,7 @@ class Grader:
                 errors.append(message)
             self.done()
         surfaces = episode.truth.surfaces if episode else None
-        on_surfaces = any(input_kind(name) in ON_SURFACES for _, names in group for name in names)
+        on_surfaces = any(input_kind(name) in (*ON_SURFACES, *JUDGED) for _, names in group for name in names)
         return GroupResult(group[0][0].episode, errors, notes, has_shapes=not on_surfaces or surfaces is None or surfaces.known)
 
     def read_episode(self, group: Group) -> EpisodeCache:

@@ -28,7 +28,7 @@ from xew.concurrency import (
 )
 from xew.config import admit, pick
 from xew.metrics.backends import MASKERS, TRACKERS, Masker, Tracker, open_masker, open_tracker
-from xew.metrics.grade import input_kind
+from xew.metrics.grade import JUDGED, input_kind
 from xew.metrics.grading.codecs import ModelCodec, open_codecs
 from xew.metrics.grading.grade_episodes import Grader, Group, GroupResult, ThreadResources, split_groups
 from xew.metrics.grading.list_jobs import Job
@@ -50,7 +50,7 @@ MOST_THREADS = 6
 """Number of cores that the threads of one process keep busy, which wait for Python's lock a fifth of their time."""
 FEWEST_VIDEOS = 48
 """Number of videos from which on processes pay on a CPU, each of which takes some ten seconds to start."""
-POINT_KINDS = {"keypoints", "objects", "robot_points", "object_points"}
+POINT_KINDS = {"keypoints", "objects", "robot_points", "object_points", *JUDGED}
 """Kinds of a metric's input that a tracker finds."""
 
 

@@ -9,13 +9,16 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from xew.config import ConfigError, pick, suggestion
-from xew.dataset import view_folder
+from xew.dataset import holds_faults, view_folder
 from xew.metrics import METRICS, perceptual
 from xew.metrics.backends import MASKERS, TRACKERS, identity
 from xew.metrics.grading.scores import CellStore, baselines_folder, path_beside, surfaces_folder
-from xew.metrics.metric import SUITES
+from xew.metrics.metric import OUTCOME, SUITES
 from xew.metrics.networks import alexnet
 from xew.protocol import GRADING_PROTOCOL, HEAD
+
+WITHOUT_OUTCOME = tuple(name for name, metric in METRICS.items() if metric.dimension != OUTCOME)
+"""Metrics of data sets in which every episode is a success, so a video that always shows success is right."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +32,7 @@ class Args:
     out: Path = Path("scores.parquet")
     """Score table; all other files lie next to it."""
     metrics: tuple[str, ...] = tuple(METRICS)
-    """Names of xew.metrics.METRICS."""
+    """Names of xew.metrics.METRICS. Left out: all; those of outcomes only if the data set holds faulty episodes."""
     suite: tuple[str, ...] = tuple(SUITES)
     """Suites whose metrics are graded: paper, strict, or both."""
     masks: str = "default"
@@ -108,7 +111,8 @@ def resolve(args: Args) -> GradingSettings:
         EpisodeError: the data set does not have the view.
     """
     args = replace(args, data=view_folder(args.data, args.view), view=HEAD)
-    metrics = choose_metrics(args.metrics, args.suite)
+    names = args.metrics if args.metrics != tuple(METRICS) or holds_faults(args.data) else WITHOUT_OUTCOME
+    metrics = choose_metrics(names, args.suite)
     check_weights(metrics)
     estimators = {
         "masks": _identify(MASKERS, "masker", args.masks, args.masks_checkpoint),

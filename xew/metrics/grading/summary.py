@@ -109,3 +109,20 @@ def _pair_lines(pairs: pd.DataFrame) -> list[str]:
 def title(model: tuple[Any, ...]) -> str:
     """A model's name for people, with its condition."""
     return plain_markdown(" · ".join(part for part in model if part).replace("|", "/"))
+
+
+def ranking_to_markdown(ranking: pd.DataFrame) -> str:
+    """Text for people of `xew.statistics.rank_policies`: a line per robot and model; empty for an empty table."""
+    if ranking.empty:
+        return ""
+    lines = ["", "## Policy ranking", ""]
+    lines += ["The expert and its faults are policies: success rates in predicted video against those in the simulator.", ""]
+    lines += ["| robot | model | Pearson's r | Spearman | MMRV | policies | scenes |", "|---|---|---|---|---|---|---|"]
+    for (robot, *model), own in ranking.groupby(["robot", "model", "condition"], sort=False):
+        cells = [
+            f"{value:.3f}" + ("" if math.isnan(low) else f" [{low:.3f}, {high:.3f}]")
+            for value, low, high in own[["value", "low", "high"]].to_numpy(float)
+        ]
+        counts = own[["policies", "scenes"]].iloc[0]
+        lines.append(f"| {robot} | {title(tuple(model))} | {' | '.join(cells)} | {counts['policies']} | {counts['scenes']} |")
+    return "\n".join(lines) + "\n"

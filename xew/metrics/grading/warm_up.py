@@ -16,7 +16,7 @@ import xew
 from xew.files import cache_folder, write_text
 from xew.metrics import METRICS, perceptual
 from xew.metrics.episode_cache import EpisodeCache, is_on_cpu
-from xew.metrics.grade import ON_SURFACES, Comparison, grade, input_kind
+from xew.metrics.grade import JUDGED, ON_SURFACES, Comparison, grade, input_kind
 from xew.metrics.grading.list_jobs import Job
 from xew.metrics.grading.settings import GradingSettings
 from xew.metrics.metric import ACCELERATOR_CHUNK
@@ -78,9 +78,9 @@ def note_compiled(settings: GradingSettings, jobs: Sequence[Job]) -> None:
 def list_kernels(settings: GradingSettings) -> list[str]:
     """Modules of kernels that the metrics need."""
     kinds, kernels = {input_kind(name) for name in settings.metrics}, _kernels()
-    modules = [*kernels.OF_SURFACES] if kinds & {"mask", "bodies", *ON_SURFACES} else []
+    modules = [*kernels.OF_SURFACES] if kinds & {"mask", "bodies", *ON_SURFACES, *JUDGED} else []
     modules += kernels.OF_MASKS if "mask" in kinds and settings.args.masks == DEFAULT else []
-    has_tracks = any(METRICS[name].inputs == "track" for name in settings.metrics)
+    has_tracks = any(METRICS[name].inputs in ("track", *JUDGED) for name in settings.metrics)
     return modules + [*kernels.OF_TRACKS] * (has_tracks and settings.args.tracks == DEFAULT)
 
 
@@ -90,7 +90,7 @@ def list_programs(settings: GradingSettings, jobs: Sequence[Job]) -> list[Progra
     for name in settings.metrics:
         metric = METRICS[name]
         of_network = metric.function.__module__ == perceptual.__name__
-        if metric.inputs != "track":
+        if metric.inputs not in ("track", *JUDGED):
             parts.setdefault("network" if of_network else "whole" if metric.whole else "frame", []).append(name)
     return [Programs(tuple(names), _find_shapes(settings, jobs)) for names in parts.values()]
 

@@ -29,6 +29,7 @@ FORMS = {
     "pixels": "float32 t p 2",
     "visible": "bool t p",
     "body": "int32 p",
+    "local": "float32 p 3",
     "shown": "int16 t h w",
     "is_robot": "bool b",
     "displacement": "float32 t b",

@@ -66,7 +66,7 @@ def read_surfaces(folder: Path, keep: Path | None = None) -> SurfaceTracks | Non
     """
     record = read_record(folder)
     try:
-        scene = None if record.source or record.camera.parts else _find_scene(record)
+        scene = None if record.source or record.camera.parts else find_scene(record)
         robot = recorded_robot(record.robot, data_folder(folder))
     except UntrustedError:
         raise
@@ -113,7 +113,7 @@ def _render_surfaces(robot: RobotSpec, scene: Scene, states: States) -> SurfaceT
     return track_surfaces([recording], [scene_names(scene)], default_renderer(), camera, Stage(raised=scene.raised))[0]
 
 
-def _find_scene(record: Record) -> Scene | None:
+def find_scene(record: Record) -> Scene | None:
     """The scene of an episode; None if its task now makes another scene of its seed."""
     scene = make_scene(recorded_task(record.task), record.task, record.seed, record.change)
     return scene if scene.names == record.object_names and scene_hash(scene) == record.scene_hash else None

@@ -53,6 +53,8 @@ class SurfaceTracks:
     """[t p] bool."""
     body: np.ndarray
     """[p] int32, index of a point's body."""
+    local: np.ndarray
+    """[p 3] float32, place of a point in its body's frame [m]."""
     shown: np.ndarray
     """[t h w] int16, index of a pixel's body, -1 for any other."""
     names: tuple[str, ...]
@@ -85,6 +87,8 @@ class _Placed:
     """[t p 3]."""
     body: np.ndarray
     """[p] int, index of each point's body in its world."""
+    local: np.ndarray
+    """[p 3] m, frame of the body."""
 
 
 @dataclass(frozen=True)
@@ -108,10 +112,12 @@ class _Seen:
     """[t p] bool."""
     body: np.ndarray
     """[p] int, index of each point's body in its world."""
+    local: np.ndarray
+    """[p 3] m, frame of the body."""
 
     def select(self, points: np.ndarray) -> "_Seen":
         """The points of an index [k]."""
-        return _Seen(self.pixels[:, points], self.visible[:, points], self.body[points])
+        return _Seen(self.pixels[:, points], self.visible[:, points], self.body[points], self.local[points])
 
 
 def track_surfaces(
@@ -152,7 +158,7 @@ def _place(points: Mapping[int, _Points], pose: np.ndarray) -> _Placed:
     matrix = matrix_from_pose(pose)[:, body]
     xyz, normal = (np.concatenate([getattr(some, name) for some in points.values()]) for name in ("xyz", "normal"))
     world = np.einsum("tpij,pj->tpi", matrix[..., :3, :3], xyz) + matrix[..., :3, 3]
-    return _Placed(world, np.einsum("tpij,pj->tpi", matrix[..., :3, :3], normal), body)
+    return _Placed(world, np.einsum("tpij,pj->tpi", matrix[..., :3, :3], normal), body, xyz)
 
 
 @lru_cache(maxsize=32)
@@ -187,6 +193,7 @@ def _tracks(view: _View, thing_names: Sequence[str], placed: _Placed) -> Surface
         pixels=points.pixels.astype(np.float32),
         visible=points.visible,
         body=number[points.body].astype(np.int32),
+        local=points.local.astype(np.float32),
         shown=number[view.shown.body],
         names=tuple([*links, *thing_names][b] for b in bodies),
         is_robot=bodies < len(links),
@@ -201,13 +208,13 @@ def _see(camera: Camera, placed: _Placed, body: np.ndarray, depth: np.ndarray, l
     to_camera = camera.position[..., None, :] - placed.xyz
     facing = np.einsum("tpi,tpi->tp", placed.normal, to_camera) > least_facing * np.linalg.norm(to_camera, axis=-1)
     near = (own_depth > 0) & (np.abs(depth - own_depth) < DEPTH_MARGIN)
-    return _Seen(pixels, (body == placed.body) & facing & near, placed.body)
+    return _Seen(pixels, (body == placed.body) & facing & near, placed.body, placed.local)
 
 
 def _join(parts: Sequence[_Seen]) -> _Seen:
     """The points of all parts."""
     pixels, visible = (np.concatenate([getattr(part, name) for part in parts], axis=1) for name in ("pixels", "visible"))
-    return _Seen(pixels, visible, np.concatenate([part.body for part in parts]))
+    return _Seen(pixels, visible, *(np.concatenate([getattr(part, name) for part in parts]) for name in ("body", "local")))
 
 
 def _fill(view: _View, bodies: Sequence[int], aim: int | np.ndarray, first: _Seen) -> _Seen:

@@ -1,0 +1,80 @@
+"""Policy ranking against values worked out by hand and SciPy's."""
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy.stats import pearsonr, spearmanr
+
+from xew.protocol import join_fault
+from xew.statistics.ranking import RANKINGS, mean_max_rank_violation, policy_ranking, rank_policies
+
+
+@pytest.mark.parametrize(
+    ("judged", "true", "violation"),
+    [
+        ([0.2, 0.5, 0.9], [0.1, 0.4, 0.8], 0),
+        ([0.5, 0.2, 0.9], [0.1, 0.4, 0.8], (0.3 + 0.3 + 0) / 3),  # one neighboring pair is wrong
+        ([0.9, 0.5, 0.2], [0.1, 0.4, 0.8], (0.7 + 0.4 + 0.7) / 3),  # all pairs are
+        ([0.5, 0.5, 0.5], [0.1, 0.4, 0.8], (0.7 + 0.4 + 0) / 3),  # a tie of what differs counts for the lower policy
+        ([0.1, 0.4, 0.8], [0.5, 0.5, 0.5], 0),  # what does not differ cannot be ranked wrongly
+    ],
+)
+def test_mmrv_is_the_worst_wrong_pair_of_each_policy(judged: list, true: list, violation: float) -> None:
+    assert mean_max_rank_violation(np.array(judged), np.array(true)) == pytest.approx(violation)
+
+
+def ranking_rows(scenes: int = 40) -> pd.DataFrame:
+    rng = np.random.default_rng(0)
+    rows = [
+        {
+            "task": f"task{seed % 4}",
+            "seed": seed,
+            "policy": policy,
+            "true": float(rng.random() < rate),
+            "judged": float(rng.random() < rate),
+        }
+        for seed in range(scenes)
+        for policy, rate in enumerate((0.1, 0.4, 0.6, 0.9))
+    ]
+    return pd.DataFrame(rows)
+
+
+def test_policies_are_ranked_by_their_rates_with_intervals_over_scenes() -> None:
+    rows = ranking_rows()
+    ranking = policy_ranking(rows.sample(frac=1, random_state=1))
+    rates = rows.groupby("policy")[["judged", "true"]].mean().to_numpy().T
+    expected = (pearsonr(*rates).statistic, spearmanr(*rates).statistic, mean_max_rank_violation(*rates))
+    assert [mean.value for mean in ranking.values()] == pytest.approx(expected)
+    assert list(ranking) == list(RANKINGS)
+    for mean in ranking.values():
+        low, high = mean.interval()
+        assert low <= mean.value <= high and high > low
+
+
+def test_one_policy_has_no_rank() -> None:
+    with pytest.raises(ValueError, match="1 policies to rank"):
+        policy_ranking(ranking_rows().query("policy == 1"))
+
+
+def score_rows(judged: dict[int, tuple[int, ...]], true: dict[int, tuple[int, ...]], robot: str = "piper") -> list[dict]:
+    """Rows of a score table: outcomes of policies (keys) in scenes 0, 1, ..."""
+    rows = []
+    for policy, outcomes in judged.items():
+        for seed, (shown, success) in enumerate(zip(outcomes, true[policy], strict=True)):
+            key = {"model": "m", "condition": "c", "task": "t", "seed": join_fault(policy, seed), "robot": robot}
+            rows.append(key | {"metric": "outcome_accuracy", "value": float(shown == success)})
+            rows += [] if success else [key | {"metric": "hallucinated_success", "value": float(shown)}]
+    return rows
+
+
+def test_rates_of_a_score_table_rank_the_expert_and_its_faults() -> None:
+    true = {0: (1, 1, 1, 1), 1: (1, 1, 0, 0), 2: (0, 0, 0, 0)}
+    judged = {0: (1, 1, 1, 0), 1: (1, 0, 0, 0), 2: (1, 1, 0, 0)}  # rates .75, .25, .5 instead of 1, .5, 0
+    table = rank_policies(pd.DataFrame(score_rows(judged, true)), {"Piper": ["piper"]}).set_index("measure")
+    assert table["value"].to_dict() == pytest.approx({"pearson": 0.5, "spearman": 0.5, "mmrv": (0 + 0.5 + 0.5) / 3})
+    assert set(table["policies"]) == {3} and set(table["scenes"]) == {4} and set(table["robot"]) == {"Piper"}
+
+
+def test_experts_alone_are_not_ranked() -> None:
+    expert = {0: (1, 1)}
+    assert rank_policies(pd.DataFrame(score_rows(expert, expert)), {"Piper": ["piper"]}).empty

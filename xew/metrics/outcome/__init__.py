@@ -1,0 +1,10 @@
+"""Outcomes: what commands cause, as predicted video shows it, against what they cause in the simulator.
+
+    measures.py  outcome accuracy, progress error, counterfactual retrieval
+    poses.py     poses of objects from tracked points
+    judge.py     what a judge of an episode knows, and progress of estimated poses
+
+Policy ranking rests on rates alone: `xew.statistics.ranking`.
+"""
+
+__all__ = ["judge", "measures", "poses"]

@@ -1,0 +1,218 @@
+"""A judge of outcomes without weights: objects' poses in a predicted video, and the progress of a task that they mean.
+
+The judge knows what a model was given: the scene at first, the camera, and the commands. The hands' paths are those that the
+commands had in the simulator; a hand touches what it is near to.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import jax
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from xew.episode import Record, States, data_folder, episode_folder, read_record, read_states
+from xew.metrics.metric import fill_up
+from xew.metrics.outcome.poses import REACH, Bodies, Hands, Lens, follow_bodies
+from xew.protocol import ARMS, split_fault
+
+if TYPE_CHECKING:
+    from xew.sim_warp.scene import Hinge, Scene
+    from xew.sim_warp.tasks import Task
+
+FRAME_BLOCK, POINT_BLOCK, BODY_BLOCK = 64, 32, 4
+"""Numbers of frames, points and bodies that episodes are filled up to multiples of, so they share a few compiled programs."""
+OPEN = 0.8
+"""Command of a gripper from which on it holds nothing."""
+UNJUDGED = ("grab_roller", "open_laptop", "place_dual_shoes", "place_mouse_pad", "press_stapler", "shake_bottle")
+"""Tasks of which the judge says nothing, by the rule of docs/metrics.md."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """A free object or a lid, whose pose is estimated."""
+
+    index: int
+    """Number of its object in the scene."""
+    hinge: "Hinge | None"
+    """The hinge of a lid."""
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What is known of an episode besides its video."""
+
+    task: "Task"
+    scene: "Scene"
+    states: States
+    """Of all frames. Of objects after the first frame, only the functions of the truth ask."""
+    local: np.ndarray
+    """[k 3] places of tracked points in the frames of their parts [m]."""
+    part: np.ndarray
+    """[k] int, the part of each, -1 for none."""
+    variants: tuple[States, ...] = ()
+    """States under all variants of the commands in this scene, these among them; empty if there are no others."""
+
+    @property
+    def is_judged(self) -> bool:
+        """Whether the judge says something of its task."""
+        return self.task.name not in UNJUDGED
+
+    @cached_property
+    def parts(self) -> tuple[Part, ...]:
+        """What can move, in the order of `poses`."""
+        return _parts(self.scene)
+
+    def poses(self, tracks: np.ndarray, visible: np.ndarray) -> np.ndarray:
+        """Poses [t p 4 4] of the parts, world, from the first frame on.
+
+        Args:
+            tracks: [t k 2] pixels, NaN where a point is lost.
+            visible: [t k] bool, where it should be seen.
+        """
+        points = [fill_up(array, 0, POINT_BLOCK, value) for array, value in ((self.local, 0), (self.part, -1))]
+        filled = [fill_up(fill_up(array, 1, POINT_BLOCK, 0), 0, FRAME_BLOCK, 0) for array in (tracks, visible)]
+        with jax.default_device(jax.local_devices(backend="cpu")[0]):  # tracks are small
+            poses = follow_bodies(*filled, *points, *self._known(len(tracks)))
+        return np.asarray(poses)[: len(tracks), : len(self.parts)]
+
+    def true_poses(self, frames: int) -> np.ndarray:
+        """Poses [t p 4 4] of the parts in the simulator."""
+        return self._poses_of(self.states)[:frames]
+
+    def progress(self, poses: np.ndarray, frame: int) -> float:
+        """Progress in a frame in which the parts have these poses [p 4 4]."""
+        object_pose, object_joint = self.place(poses)
+        hands = self.states.tool_pose[frame, :, :3]
+        contact = np.linalg.norm(hands[:, None] - object_pose[None, :, :3], axis=-1) < REACH
+        return self._measure(object_pose, object_joint, contact, frame)
+
+    def true_progress(self, frame: int) -> float:
+        """Progress in a frame in the simulator."""
+        states = self.states
+        return self._measure(states.object_pose[frame], states.object_joint[frame], states.contact[frame], frame)
+
+    def place(self, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Poses [o 7] and hinge angles [o] rad of the scene's objects, if the parts have these poses [p 4 4]."""
+        from xew.sim_warp.geometry.poses import matrix_from_pose, pose_from_matrix  # only here: the metrics load without Warp
+
+        object_pose, object_joint = (array[0].astype(float) for array in (self.states.object_pose, self.states.object_joint))
+        for pose, part in zip(poses, self.parts, strict=True):
+            if part.hinge is None:
+                object_pose[part.index] = pose_from_matrix(pose)
+            else:
+                object_joint[part.index] = _angle(matrix_from_pose(object_pose[part.index]), pose, part.hinge)
+        return object_pose, object_joint
+
+    def distances(self, poses: np.ndarray, frames: slice) -> np.ndarray:
+        """Mean distance [v] m float32 of points on the parts from where they are under each variant of the commands.
+
+        Args:
+            poses: [t p 4 4] of the parts.
+            frames: which of them count; a variant that ends earlier stands still.
+        """
+        own = self._points_at(poses)[frames]
+        count = np.arange(len(poses))
+        others = (self._poses_of(variant) for variant in self.variants)
+        there = (self._points_at(other[np.minimum(count, len(other) - 1)])[frames] for other in others)
+        return np.array([np.linalg.norm(own - points, axis=-1).mean() for points in there], np.float32)
+
+    def _points_at(self, poses: np.ndarray) -> np.ndarray:
+        """Places [t k 3] of the points on parts with these poses [t p 4 4], world."""
+        matrix = poses[:, self.part[self.part >= 0]]
+        return np.einsum("tkij,kj->tki", matrix[..., :3, :3], self.local[self.part >= 0]) + matrix[..., :3, 3]
+
+    def _poses_of(self, states: States) -> np.ndarray:
+        """Poses [t p 4 4] of the parts in states of the scene."""
+        from xew.sim_warp.geometry.poses import matrix_from_pose
+        from xew.sim_warp.rendering.observe import scene_things
+
+        _, pose = scene_things(self.scene, states.object_pose, states.object_joint)
+        lids = [part.index for part in self.parts if part.hinge is not None]
+        bodies = [part.index if part.hinge is None else len(self.scene.objects) + lids.index(part.index) for part in self.parts]
+        return matrix_from_pose(pose[:, bodies])
+
+    def _known(self, frames: int) -> tuple[Bodies, Hands, Lens]:
+        """What the poses of the first frames rest on."""
+        from xew.sim_warp.geometry.poses import matrix_from_pose
+
+        states, frame = self.states, fill_up(np.arange(frames), 0, FRAME_BLOCK)
+        anchor, axis = np.zeros((2, len(self.parts), 3))
+        for i, part in enumerate(self.parts):
+            if part.hinge is not None:
+                base = matrix_from_pose(states.object_pose[0, part.index])
+                anchor[i] = base[:3, :3] @ part.hinge.anchor + base[:3, 3]
+                axis[i] = base[:3, :3] @ part.hinge.axis / np.linalg.norm(part.hinge.axis)
+        start = self._poses_of(states)[0]
+        hinged = np.array([part.hinge is not None for part in self.parts], bool)
+        bodies = Bodies(*(fill_up(array, 0, BODY_BLOCK) for array in (start, hinged, anchor, axis)))
+        extrinsics = np.broadcast_to(states.extrinsics, (len(states.action), 4, 4))[frame]
+        hands = Hands(matrix_from_pose(states.tool_pose[frame]), self._gripper[frame] < OPEN)
+        return bodies, hands, Lens(states.intrinsics, extrinsics)
+
+    @property
+    def _gripper(self) -> np.ndarray:
+        """[t 2] commands of the grippers."""
+        return self.states.action[:, [column for _, column in ARMS]]
+
+    def _measure(self, object_pose: np.ndarray, object_joint: np.ndarray, contact: np.ndarray, frame: int) -> float:
+        """Progress with the hands of a frame and objects at poses [o 7] and angles [o], in contact where `contact` [2 o]."""
+        from xew.sim_warp.changes.scenes import measure_progress
+        from xew.sim_warp.tasks import Moment
+
+        states, gripper = self.states, self._gripper
+        first = Moment(states.object_pose[0], states.object_joint[0], states.tool_pose[0], gripper[0], states.contact[0])
+        now = Moment(object_pose, object_joint, states.tool_pose[frame], gripper[frame], contact)
+        return measure_progress(self.task, self.scene, first, now)
+
+
+def know_outcome(
+    folder: Path, record: Record, states: States, body: Sequence[str], local: np.ndarray, with_variants: bool
+) -> Outcome | None:
+    """What a judge knows of an episode.
+
+    Args:
+        folder, record, states: of the episode.
+        body: [k] names of the bodies that points on its objects lie on.
+        local: [k 3] places of these points in the frames of their bodies [m].
+        with_variants: whether states under other variants of the commands are read.
+
+    Returns:
+        None if its scene is unknown or nothing in it can move.
+
+    Raises:
+        EpisodeError: the states of a variant are damaged.
+    """
+    from xew.sim_warp.production.surfaces import find_scene
+    from xew.sim_warp.tasks import recorded_task
+
+    scene = find_scene(record)
+    if scene is None or not _parts(scene):
+        return None
+    part_names = [scene.names[part.index] + " lid" * (part.hinge is not None) for part in _parts(scene)]
+    part = np.array([part_names.index(name) if name in part_names else -1 for name in body], int)
+    variants = _read_variants(folder, record, states) if with_variants else ()
+    return Outcome(recorded_task(record.task), scene, states, local, part, variants)
+
+
+def _parts(scene: "Scene") -> tuple[Part, ...]:
+    free = [Part(index, None) for index, thing in enumerate(scene.objects) if not thing.is_fixed]
+    return *free, *(Part(index, thing.hinge) for index, thing in enumerate(scene.objects) if thing.hinge is not None)
+
+
+def _angle(base: np.ndarray, lid: np.ndarray, hinge: "Hinge") -> float:
+    """The angle [rad] of a hinge, from the poses [4 4] of its base and its lid."""
+    turn = Rotation.from_matrix(base[:3, :3].T @ lid[:3, :3]).as_rotvec()
+    return float(turn @ hinge.axis / np.linalg.norm(hinge.axis))
+
+
+def _read_variants(folder: Path, record: Record, states: States) -> tuple[States, ...]:
+    """States of the episodes of all variants of the commands, of this one `states`; none if there is no other."""
+    data, (_, base) = data_folder(folder), split_fault(record.seed)
+    seeds = sorted(int(path.name) for path in folder.parents[1].iterdir() if path.name.isdigit())
+    folders = [episode_folder(data, record.task, seed, record.robot) for seed in seeds if split_fault(seed)[1] == base]
+    kept = [path for path in folders if (path / "episode.json").exists() and read_record(path).is_kept]
+    return tuple(states if path.samefile(folder) else read_states(path) for path in kept) if len(kept) > 1 else ()
