@@ -25,12 +25,14 @@ LEFT_ARM, LEFT_GRIPPER, RIGHT_ARM, RIGHT_GRIPPER = slice(0, 7), 7, slice(8, 15),
 ARMS = ((LEFT_ARM, LEFT_GRIPPER), (RIGHT_ARM, RIGHT_GRIPPER))
 """Columns of each arm's joints and gripper in a command."""
 
+OUTCOME = "outcome"
+"""The dimension of what commands cause. Its judge leaves out tasks itself (`xew.metrics.outcome.judge.UNJUDGED`)."""
 DIMENSION_TITLES = {
     "visual": "Visual quality",
     "morphology": "Robot morphology",
     "kinematics": "Robot kinematics",
     "objects": "Object dynamics",
-    "outcome": "Task outcome",
+    OUTCOME: "Task outcome",
 }
 """Titles of the dimensions, the groups of metrics, which are never combined into one number."""
 

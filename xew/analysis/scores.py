@@ -19,7 +19,7 @@ from pyarrow import parquet
 from xew.config import IMPORT_PATH, ConfigError, parse
 from xew.files import demand_regular, parse_json, replacing
 from xew.names import MOST_LETTERS, EpisodeError, check_label, check_name
-from xew.protocol import BASELINES, BODY_NAME, COPY_FIRST_FRAME, GROUND_TRUTH, ROBOT_NAMES, SHARED_MOTION
+from xew.protocol import BASELINES, BODY_NAME, COPY_FIRST_FRAME, GROUND_TRUTH, OUTCOME, ROBOT_NAMES, SHARED_MOTION
 
 VARIANT = "variant"
 TRAINING = "training"
@@ -83,7 +83,7 @@ class MetricInfo:
     @property
     def leaves_tasks(self) -> bool:
         """Do tasks without power leave its mean (`xew.statistics.find_power`)?"""
-        return self.estimated and "strict" in self.suites
+        return self.estimated and "strict" in self.suites and self.dimension != OUTCOME
 
     @property
     def best(self) -> float | None:

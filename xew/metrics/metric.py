@@ -39,8 +39,6 @@ objects. track: two [t k 2], valid [t k]. outcome: two [t], the task's progress.
 from what happens under k variants of the commands."""
 ESTIMATED_INPUTS = ("mask", "track", "outcome", "variants")
 """Inputs that have to be estimated in a prediction."""
-OUTCOME = "outcome"
-"""The dimension of metrics of what commands cause. Its judge leaves out tasks itself (`outcome.judge.UNJUDGED`)."""
 SUITES = {
     "paper": "the paper's definitions, so its tables compare with ours",
     "strict": "what is lost is an error, points lie on surfaces, and one tolerance holds for all robots",
@@ -140,7 +138,7 @@ class Metric:
     @property
     def leaves_tasks(self) -> bool:
         """Do tasks without power leave its mean (`xew.statistics.find_power`)?"""
-        return self.estimated and "strict" in self.suites and self.dimension != OUTCOME
+        return self.estimated and "strict" in self.suites and self.dimension != "outcome"
 
     def total(self, *inputs: AnyArray, **options: Any) -> Total:
         """Sum and number of the values that the metric averages; totals of parts of a video, or of several videos, add up.

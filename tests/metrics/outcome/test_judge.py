@@ -15,9 +15,8 @@ from xew.metrics.backends import open_masker, open_tracker
 from xew.metrics.episode_cache import EpisodeCache
 from xew.metrics.grade import Comparison, Grades, grade
 from xew.metrics.grading.settings import WITHOUT_OUTCOME, Args, resolve
-from xew.metrics.metric import OUTCOME
 from xew.metrics.truth import read_truth
-from xew.protocol import join_fault
+from xew.protocol import OUTCOME, join_fault
 from xew.sim_warp.production.cells import Job
 from xew.sim_warp.rendering.render import Renderer
 

@@ -13,9 +13,9 @@ from xew.dataset import holds_faults, view_folder
 from xew.metrics import METRICS, perceptual
 from xew.metrics.backends import MASKERS, TRACKERS, identity
 from xew.metrics.grading.scores import CellStore, baselines_folder, path_beside, surfaces_folder
-from xew.metrics.metric import OUTCOME, SUITES
+from xew.metrics.metric import SUITES
 from xew.metrics.networks import alexnet
-from xew.protocol import GRADING_PROTOCOL, HEAD
+from xew.protocol import GRADING_PROTOCOL, HEAD, OUTCOME
 
 WITHOUT_OUTCOME = tuple(name for name, metric in METRICS.items() if metric.dimension != OUTCOME)
 """Metrics of data sets in which every episode is a success, so a video that always shows success is right."""
