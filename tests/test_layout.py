@@ -241,6 +241,12 @@ def test_the_house_is_in_order(check: Callable[[Sources], list[str]]) -> None:
     assert not failures, f"{len(failures)} failures:\n" + "\n".join(failures)
 
 
+def test_names_of_test_files_are_unique() -> None:
+    """pytest imports them by name where folders have no `__init__`."""
+    names = Counter(path.name for path in Path(__file__).parent.rglob("test_*.py"))
+    assert not [name for name, count in names.items() if count > 1]
+
+
 LAB = read_sources(ROOT.parent / "lab")
 
 
