@@ -28,6 +28,7 @@ from xew.metrics.episode_cache import EpisodeCache
 from xew.metrics.grade import Comparison, grade, input_kind
 from xew.metrics.grading.settings import resolve
 from xew.metrics.truth import read_truth
+from xew.model import rollout
 from xew.model.experiment import load_experiment
 from xew.model.runs import folder as run_folder
 
@@ -42,6 +43,8 @@ NEEDS = {"score_a_pytorch_model": "torch"}
 """Packages without which a page is not run."""
 WITH_ARRAYS = ("metrics",)
 """Pages whose snippets are run in order, and held against their comments, in tests/metrics/test_page.py."""
+WITH_RUN = ("evaluate_a_policy",)
+"""Pages whose snippets are run with a trained model, in tests/model/test_simulate.py."""
 KEPT = ("XEW_TRUST", "XEW_ROBOTS")
 """Environment variables that a command or a block may set."""
 BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
@@ -149,7 +152,7 @@ def test_the_page_on_a_metric_grades_with_it(with_data: Path, monkeypatch: pytes
 SNIPPETS = [
     pytest.param(text, id=f"{page.stem}-{number}")
     for page in PAGES
-    if page.stem not in (*WALKED, *WITH_DATA, *WITH_ARRAYS)
+    if page.stem not in (*WALKED, *WITH_DATA, *WITH_ARRAYS, *WITH_RUN)
     for number, (language, text) in enumerate(blocks(page))
     if language == "python"
 ]
@@ -217,7 +220,8 @@ def dry_run(arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> str:
     with monkeypatch.context() as patch, redirect_stdout(said), redirect_stderr(said), warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # the module may have been imported before
         # The runs that pages name do not exist, and the command reads a run's config before it parses its options.
-        patch.setattr(run_folder, "load_run_config", lambda run: load_experiment(ROOT / "configs" / "fixed.yaml"))
+        for module in (run_folder, rollout):
+            patch.setattr(module, "load_run_config", lambda run: load_experiment(ROOT / "configs" / "fixed.yaml"))
         patch.setattr(argparse.ArgumentParser, "parse_known_args", parse_and_stop)
         patch.setattr(tyro, "cli", cli_and_stop)
         patch.setattr(sys, "argv", list(arguments))

@@ -18,6 +18,7 @@ COMMANDS = {
     "latents": ("xew.model.latents", "encode the episodes of a config"),
     "train": ("xew.model.train", "train a world model"),
     "rollout": ("xew.model.rollout", "predict episodes with a trained model"),
+    "simulate": ("xew.model.simulate", "run a policy inside a trained model"),
     "outside": ("xew.model.outside", "predict episodes with any other model"),
     "export": ("xew.model.export", "write a run's weights with diffusers' or Wan's names"),
     "release": ("xew.model.release", "package a run's network with its codec, config and model card"),

@@ -45,6 +45,7 @@ WRITERS: tuple[tuple[str, str, str], ...] = (
 OTHERS = {
     "model.latents": "waits: see below",
     "model.rollout": "needs a trained run: see below",
+    "model.simulate": "writes as model.rollout",
     "__main__": "runs the others",
 }
 """Other commands, with why they are none of WRITERS."""
@@ -150,7 +151,7 @@ def test_a_rollout_into_a_folder_that_another_writes_ends_in_one_line(
     data, out = tmp_path / "data", tmp_path / "out"
     flags = SimpleNamespace(data=data, out=out, checkpoint=None, split="test", robots=())
     experiment = SimpleNamespace(instructions=SimpleNamespace(encode=list), view="head")
-    monkeypatch.setattr(rollout, "parse_rollout", lambda _: (tmp_path / "run", flags, experiment))
+    monkeypatch.setattr(rollout, "parse_rollout", lambda *_: (tmp_path / "run", flags, experiment))
     monkeypatch.setattr(rollout, "select_episodes", lambda *_: [])
     with held_by_another(out) as process, pytest.raises(SystemExit, match="2"):
         rollout.main([])

@@ -11,10 +11,10 @@ Command: python -m xew.model.rollout RUN --data DATA --split test [--robots … 
 import functools
 import itertools
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 from xew.command_line import find_path, parse_command
 from xew.compilation import take_memory_as_needed
@@ -27,7 +27,8 @@ from xew.model.experiment import Experiment, parse_experiment
 from xew.model.loading import is_config, open_predictor
 from xew.model.runs.folder import load_run_config
 from xew.model.runs.layout import checkpoint_time, list_steps
-from xew.model.sampling.rolling import roll_out
+from xew.model.sampling.predict import Predictor
+from xew.model.sampling.rolling import Item, roll_out
 from xew.model.settings.checks import check_experiment
 from xew.model.settings.settings import RolloutSettings
 
@@ -72,8 +73,13 @@ def rollout_header(experiment: Experiment, step: int | None, saved: int | None, 
 
 def common_header(model: str, condition: str, record: Record, max_frames: int = 0) -> dict[str, Any]:
     """The fields that every model's rollout.json has."""
-    frames = min(record.frame_count, max_frames) if max_frames else record.frame_count
+    frames = predicted_frames(record, max_frames)
     return {"model": model, "condition": condition, "source_hash": record.hashes["rgb"], "frame_count": frames}
+
+
+def predicted_frames(record: Record, max_frames: int) -> int:
+    """Number of frames of an episode that are predicted; 0 for `max_frames` predicts all."""
+    return min(record.frame_count, max_frames) if max_frames else record.frame_count
 
 
 def is_done(out: Path, episode: Episode, header: dict[str, Any]) -> bool:
@@ -104,6 +110,11 @@ class Flags:
     """Custom modules, such as my_lab.tasks, that the run and the data may name."""
 
 
+F = TypeVar("F", bound=Flags)
+Predict = Callable[[Callable[[], Predictor], Sequence[Item], Path], None]
+"""Function that predicts and writes episodes, as `roll_out`."""
+
+
 @dataclass(frozen=True)
 class RunChoices:
     """Settings of a run that rollouts can change."""
@@ -114,20 +125,39 @@ class RunChoices:
 @user_errors
 def main(arguments: Sequence[str] | None = None) -> None:
     """Predict episodes and write them."""
-    run, flags, experiment = parse_rollout(arguments)
+    run, flags, experiment = parse_rollout(arguments, Flags, "python -m xew.model.rollout", __doc__.splitlines()[0])
+    predict_pending(run, flags, experiment, roll_out)
+
+
+def predict_pending(
+    run: Path,
+    flags: Flags,
+    experiment: Experiment,
+    predict: Predict,
+    out: Path | None = None,
+    extra: Mapping[str, Any] | None = None,
+) -> None:
+    """Predict the episodes that a command line chooses and that its folder lacks.
+
+    Args:
+        run, flags, experiment: the parsed command line.
+        predict: predicts and writes them.
+        out: folder to write to without --out (default: rollouts/<name of the run>).
+        extra: further fields of rollout.json.
+    """
     take_memory_as_needed()
-    data, out = flags.data or experiment.data, flags.out or Path("rollouts") / default_name(run)
+    data, out = flags.data or experiment.data, flags.out or out or Path("rollouts") / default_name(run)
     check_out(out, data)
     episodes = select_episodes(view_folder(data, experiment.view), flags.split, flags.robots or None)
     step = find_step(run, flags.checkpoint)
     saved = None if step is None else checkpoint_time(run, step)
-    headers = [(episode, rollout_header(experiment, step, saved, episode)) for episode in episodes]
+    headers = [(episode, rollout_header(experiment, step, saved, episode) | dict(extra or {})) for episode in episodes]
     pending = [item for item in headers if not is_done(out, *item)]
     with hold_lock(out):
         remove_left_overs(out)
         if pending:
             experiment.instructions.encode([record.instruction for (_, record), _ in pending])  # at once, where that costs
-            roll_out(functools.partial(open_predictor, run, experiment, step), pending, out)
+            predict(functools.partial(open_predictor, run, experiment, step), pending, out)
     source = "published weights" if step is None else f"checkpoint {step}"
     print(f"{out}: {len(pending)} rollouts new, {len(headers) - len(pending)} there before, {source}")
 
@@ -139,22 +169,22 @@ def _find_trusted(words: Sequence[str]) -> list[str]:
     return [name for name in names if name.replace(".", "_").isidentifier() and ".." not in name]
 
 
-def parse_rollout(arguments: Sequence[str] | None) -> tuple[Path, Flags, Experiment]:
-    """Parse the command line: the run or config, the command's flags, and the experiment with its overrides.
+def parse_rollout(arguments: Sequence[str] | None, kind: type[F], prog: str, description: str) -> tuple[Path, F, Experiment]:
+    """Parse the command line: the run or config, the command's flags of this kind, and the experiment with its overrides.
 
     A run takes only --rollout.… overrides; a config with published weights takes all overrides.
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
-    path, prog, description = find_path(words, Flags), "python -m xew.model.rollout", __doc__.splitlines()[0]
+    path = find_path(words, kind)
     if path is not None and is_config(path):
-        flags, experiment = parse_experiment(Flags, words, prog, description)
+        flags, experiment = parse_experiment(kind, words, prog, description)
         return path, flags, experiment
     refused = [word for word in words if word.startswith("--") and "." in word and not word.startswith("--rollout.")]
     if path is not None and refused:
         raise ConfigError(f"{' '.join(refused)}: a trained run takes only --rollout.… overrides (see --help for the rest).")
     admit(_find_trusted(words))  # the run's config is read before the options are parsed
     command = parse_command(
-        Flags,
+        kind,
         RunChoices,
         lambda run: RunChoices(load_run_config(run).rollout),
         words,

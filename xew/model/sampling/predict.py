@@ -13,7 +13,7 @@ import zlib
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -39,6 +39,8 @@ from xew.model.settings.parts import ClipInputs
 from xew.model.settings.settings import RolloutSettings
 from xew.model.text.instructions import Instructions
 
+T = TypeVar("T")
+
 
 class ChunkInputs(NamedTuple):
     """Input of the network for one chunk of each episode of a batch."""
@@ -57,6 +59,23 @@ class ChunkInputs(NamedTuple):
     """Number of the chunk."""
     given: GivenFrames | None = None
     """Render and scene for the codec's decoder, or None."""
+
+
+class Continuation(NamedTuple):
+    """A batch of episodes while it is being predicted, chunk by chunk."""
+
+    first: Array
+    """[b 1 h w 3] uint8, first frames."""
+    unaligned: Mapping[str, Array]
+    """Latents of the pictures that every chunk reuses, by stream."""
+    text: Array
+    """As in `ChunkInputs`."""
+    negative: Array | None
+    """As in `ChunkInputs`."""
+    names: Array
+    """[b] uint32, numbers of the episodes, for their noise."""
+    chunks: list[Array]
+    """Chunks of frames [b t h w 3] uint8 predicted so far."""
 
 
 class ChunkSampling(NamedTuple):
@@ -108,25 +127,43 @@ class Predictor:
     def begin(self, episodes: Sequence[EpisodeInputs], frame_count: int, batch: int = 1) -> Prediction:
         """Start to predict the first `frame_count` frames of episodes that were read, without waiting for the devices.
 
+        `batch` as in `start`.
+        """
+        started, streams = self.start(episodes, batch), [streams for _, streams in episodes]
+        for _ in range(0, max(frame_count - 1, 1), self.inputs.clip.frames - 1):
+            self.extend(started, streams)
+        return Prediction(started.chunks, len(episodes), frame_count)
+
+    def start(self, episodes: Sequence[EpisodeInputs], batch: int = 1) -> Continuation:
+        """Encode what all chunks of episodes share; of aligned streams it needs none.
+
         The last episode is repeated to fill `batch` and the devices, so no smaller batch is compiled.
         """
         size = max(len(episodes), batch)
-        size += -size % self._devices
-        padded = [*episodes, *[episodes[-1]] * (size - len(episodes))]
+        padded = _fill_up(episodes, size + -size % self._devices)
         records, streams = [record for record, _ in padded], [streams for _, streams in padded]
         text, negative = self._encode_text(records)
         names = self._place(np.array([name_number(record) for record in records], np.uint32))
         (first,) = self._join(streams, {FIRST: np.zeros(1, int)}).values()
-        unaligned, sampling = self._encode_unaligned(streams), self._sampling
-        chunks: list[Array] = []
-        for number, start in enumerate(range(0, max(frame_count - 1, 1), self.inputs.clip.frames - 1)):
-            history = self._encode_history(first, chunks, start)
-            aligned, given = self._encode_aligned(streams, start)
-            reference, conditions = chunks[-1][:, -1:] if chunks else first, unaligned | history | aligned
-            inputs = ChunkInputs(reference, conditions, text, negative, names, number, given)
-            with jax.set_mesh(self._mesh) if self._mesh is not None else nullcontext():
-                chunks.append(predict_chunk(self.graph, self.params, self.codec, inputs, sampling))
-        return Prediction(chunks, len(episodes), frame_count)
+        return Continuation(first, self._encode_unaligned(streams), text, negative, names, [])
+
+    def extend(self, started: Continuation, episodes: Sequence[Streams]) -> Array:
+        """Predict the next chunk [b t h w 3] uint8, without waiting for the devices; it begins with the last frame so far.
+
+        Args:
+            started: the batch, to which the chunk is added.
+            episodes: streams of each episode, at least of all frames so far and of the chunk; their ends are repeated.
+        """
+        first, chunks = started.first, started.chunks
+        streams, number = _fill_up(episodes, len(first)), len(chunks)
+        start = number * (self.inputs.clip.frames - 1)
+        history = self._encode_history(first, chunks, start)
+        aligned, given = self._encode_aligned(streams, start)
+        reference, conditions = chunks[-1][:, -1:] if chunks else first, {**started.unaligned, **history, **aligned}
+        inputs = ChunkInputs(reference, conditions, started.text, started.negative, started.names, number, given)
+        with jax.set_mesh(self._mesh) if self._mesh is not None else nullcontext():
+            chunks.append(predict_chunk(self.graph, self.params, self.codec, inputs, self._sampling))
+        return chunks[-1]
 
     @property
     def _sampling(self) -> ChunkSampling:
@@ -135,7 +172,7 @@ class Predictor:
 
     @property
     def reader(self) -> EpisodeReader:
-        """Reader of the inputs of `begin`."""
+        """Reader of the inputs of `begin` and `start`."""
         conditions = self.inputs.conditions
         return EpisodeReader(conditions, self.inputs.clip, gives_render(self.codec, conditions))
 
@@ -229,6 +266,11 @@ class Predictor:
         if self._mesh is None:
             return jnp.asarray(array)
         return jax.device_put(array, batch_sharding(self._mesh) if self._devices > 1 else replicated_sharding(self._mesh))
+
+
+def _fill_up(items: Sequence[T], size: int) -> list[T]:
+    """A list of `size` items, of which the last is repeated."""
+    return [*items, *[items[-1]] * (size - len(items))]
 
 
 def make_predictor(experiment: Experiment, codec: Codec, params: Any, scales: Mapping[str, Scale]) -> Predictor:

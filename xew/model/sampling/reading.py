@@ -8,7 +8,7 @@ import numpy as np
 from xew.dataset import Episode
 from xew.episode import Record, read_pixels
 from xew.model.cache.clips import needed_pixels, read_streams
-from xew.model.conditions import Condition, shows_carried
+from xew.model.conditions import Command, Condition, shown_scene
 from xew.model.devices.parts import RENDERERS, read_ahead
 from xew.model.episodes.commands import episode_command
 from xew.model.settings.settings import Clip
@@ -37,16 +37,24 @@ class EpisodeReader:
 
     def read(self, episode: Episode) -> EpisodeInputs:
         """Read the first frame of an episode and its conditions; threads may call it."""
+        folder, record = episode
+        pixels = stored_pixels(folder, record, needed_pixels(self.conditions, self._names))
+        first = read_pixels(folder, "rgb", most=1, record=record)
+        return self.make(episode, episode_command(folder, record, pixels.get("robot"), first), first)
+
+    def make(self, episode: Episode, command: Command, first: np.ndarray) -> EpisodeInputs:
+        """The inputs of an episode with its first frame [1 h w 3] uint8 under a command, not necessarily the recorded one."""
         (folder, record), clip = episode, self.clip
-        names = [name for name, condition in self.conditions.items() if condition.make is not None]
-        pixels = stored_pixels(folder, record, needed_pixels(self.conditions, names))
-        given = {FIRST: read_pixels(folder, "rgb", most=1, record=record)}
-        command = episode_command(folder, record, pixels.get("robot"), given[FIRST])
+        given = {FIRST: first}
         if self.gives_render:
-            scene = command.carried_scene if shows_carried(self.conditions.values()) else given[FIRST]
-            given |= {RENDER: pixels["robot"], SCENE: scene}
+            given |= {RENDER: command.render, SCENE: shown_scene(self.conditions.values(), command)}
         resized = {name: to_model_size(video, clip.height, clip.width) for name, video in given.items()}
-        return record, resized | read_streams(self.conditions, clip, folder, record, names, pixels, command)
+        return record, resized | read_streams(self.conditions, clip, folder, record, self._names, {}, command)
+
+    @property
+    def _names(self) -> list[str]:
+        """Streams of conditions that are made from commands."""
+        return [name for name, condition in self.conditions.items() if condition.make is not None]
 
     def read_ahead(
         self, episodes: Sequence[Episode], threads: int | None = None, processes: int = 0
