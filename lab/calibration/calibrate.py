@@ -57,27 +57,35 @@ Episode = tuple[Path, Record]
 
 
 @dataclass(frozen=True)
-class Args:
-    """Calibrate the metrics on a data set of `xew.sim_warp.generate`."""
+class CommonArgs:
+    """Options of both commands that calibrate."""
 
     data: Path = Path("data")
-    """At least two robots and two seeds of a task, or the videos of others are left out."""
+    """A data set; with fewer than two robots and two seeds of a task the videos of others are left out."""
     out: Path = Path("calibration")
     """Folder of the tables."""
     codec: Path | None = None
-    """A run of `xew.model.train`, through whose codec the true videos go."""
+    """A run or a config of `xew.model.train`, through whose codec the true videos go."""
     seeds: tuple[int, ...] = ()
     """Only episodes of these seeds; all others serve as another seed's. Left out: those of validation seeds, or where there are
     none of training seeds; never of test seeds, since estimators are chosen and tuned by what comes out."""
     episodes: int = 0
     """At most so many, of as many robots and tasks as there are; 0: all."""
-    masks: str = "default"
-    """Estimator of robot masks: a name of xew.metrics.backends.MASKERS, or module:NAME."""
-    masks_checkpoint: Path | None = None
-    """Its weights, where it has some."""
     tracks: str = "default"
     """Estimator of keypoints and objects: a name of xew.metrics.backends.TRACKERS, or module:NAME."""
     tracks_checkpoint: Path | None = None
+    """Its weights, where it has some."""
+    trust: tuple[str, ...] = ()
+    """Custom modules, such as my_lab.tasks, that the run and the data may name."""
+
+
+@dataclass(frozen=True)
+class Args(CommonArgs):
+    """Calibrate the metrics on a data set of `xew.sim_warp.generate`."""
+
+    masks: str = "default"
+    """Estimator of robot masks: a name of xew.metrics.backends.MASKERS, or module:NAME."""
+    masks_checkpoint: Path | None = None
     """Its weights, where it has some."""
     predictors: bool = False
     """Grade predictors made on purpose, instead of both tables."""
@@ -85,8 +93,6 @@ class Args:
     """Names of the metrics of the predictors' table."""
     cases: tuple[str, ...] = tuple(PREDICTORS)
     """Names of the predictors that are graded."""
-    trust: tuple[str, ...] = ()
-    """Custom modules, such as my_lab.tasks, that the run and the data may name."""
 
 
 @dataclass(frozen=True)
@@ -174,7 +180,7 @@ def calibrate(
     return rows | {"frames": pd.concat(frames, ignore_index=True)}
 
 
-def choose(episodes: Sequence[Episode], args: Args) -> list[Episode]:
+def choose(episodes: Sequence[Episode], args: CommonArgs) -> list[Episode]:
     """Those to calibrate on. Raises ConfigError if the data does not hold a seed asked for, or test seeds alone and none is."""
     if not args.seeds:
         families = ([e for e in episodes if seed_split(e[1].seed) == family] for family in ("validation", "train"))

@@ -21,8 +21,7 @@ import pandas as pd
 import tyro
 from tqdm import tqdm
 
-from lab.calibration import calibrate
-from lab.calibration.calibrate import Row, as_markdown, choose, write
+from lab.calibration.calibrate import CommonArgs, Row, as_markdown, choose, write
 from lab.calibration.perturbations import render_perturbation
 from lab.calibration.predictors import hold_objects, through_h264
 from xew.config import admit, user_errors
@@ -46,24 +45,8 @@ CANDIDATES = tuple(round(0.5 + 0.05 * step, 2) for step in range(11))
 
 
 @dataclass(frozen=True)
-class Args:
-    """Calibrate the judge of outcomes on a data set of `xew.sim_warp.generate`."""
-
-    data: Path = Path("data")
-    out: Path = Path("calibration")
-    """Folder of the tables."""
-    codec: Path | None = None
-    """A run or a config of `xew.model.train`, through whose codec the true videos go; left out: H.264."""
-    seeds: tuple[int, ...] = ()
-    """Only episodes of these seeds. Left out: validation seeds, or where there are none training seeds; never test seeds."""
-    episodes: int = 0
-    """At most so many, of as many robots and tasks as there are; 0: all."""
-    tracks: str = "default"
-    """Estimator of points on objects: a name of xew.metrics.backends.TRACKERS, or module:NAME."""
-    tracks_checkpoint: Path | None = None
-    """Its weights, where it has some."""
-    trust: tuple[str, ...] = ()
-    """Custom modules, such as my_lab.tasks, that the data may name."""
+class Args(CommonArgs):
+    """Calibrate the judge of outcomes on a data set of `xew.sim_warp.generate`; without a codec videos go through H.264."""
 
 
 @user_errors
@@ -75,13 +58,8 @@ def main(args: Args) -> None:
     episodes = find_accepted(args.data)
     demand_one_motion(args.data, [record for _, record in episodes])
     with hold_lock(args.out):
-        rows = [
-            row
-            for episode in tqdm(
-                choose(episodes, calibrate.Args(args.data, seeds=args.seeds, episodes=args.episodes)), unit="episode"
-            )
-            for row in judge_episode(*episode, tracker, codec)
-        ]
+        chosen = tqdm(choose(episodes, args), unit="episode")
+        rows = [row for episode in chosen for row in judge_episode(*episode, tracker, codec)]
         table = pd.DataFrame(rows)
         text = report(table)
         write(args.out, text, {"outcome": table}, "outcome.md")

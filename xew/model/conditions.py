@@ -420,6 +420,7 @@ ACTIONS: dict[str, Condition | System] = {
         label="tool poses",
     ),
 }
+CARRIED_RENDER = Condition("carried_render", "map_channels", carried_render, is_guess=True)
 CONDITIONS: dict[str, Condition | System] = {
     "none": System((), title="No description", label="flow only"),
     "reference_image": Condition(
@@ -451,15 +452,12 @@ CONDITIONS: dict[str, Condition | System] = {
         label="per-frame render pasted into the first frame",
     ),
     "carried_render": System(
-        (Condition("carried_render", "map_channels", carried_render, is_guess=True),),
+        (CARRIED_RENDER,),
         title="Per-frame render in a scene with carried objects",
         label="per-frame render pasted into the first frame, with carried objects",
     ),
     "carried_render_and_shadows": System(
-        (
-            Condition("carried_render", "map_channels", carried_render, is_guess=True),
-            Condition("three_shadows", "shadow_channels", three_shadows),
-        ),
+        (CARRIED_RENDER, Condition("three_shadows", "shadow_channels", three_shadows)),
         title="Per-frame render in a scene with carried objects, and its shadows",
         label="per-frame render pasted into the first frame, with carried objects, and its shadows",
     ),
