@@ -43,7 +43,7 @@ def main(args: Args) -> None:
     with TemporaryDirectory() as folder:
         asked = generate.Args((args.task,), tuple(robots), out=Path(folder), workers=args.workers, device="cpu")
         production = Production(Path(folder), robots)
-        with generate.start_workers(asked, robots) as make:
+        with generate.start_workers(asked, robots) as (_, make):
             ways: dict[str, Callable[[], list[Record]]] = {
                 "one process": lambda: write_scene(simulate_jobs([job], production)[0], production.out, renderer),
                 f"robot by robot, {args.workers} workers": lambda: next(iter(make([job])))[0],

@@ -2,19 +2,22 @@
 
 import json
 import shutil
+import zlib
 from collections import Counter
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
 
-from tests.sim_warp.small import TASK, work_inline
+from tests.sim_warp.small import TASK, InlineWorkers, work_inline
 from xew.dataset import find_accepted, read_dataset
 from xew.episode import EpisodeError, Record, read_pixels, read_record
 from xew.protocol import FRAME_RATE, TEST_SEED_START, join_fault, seed_split, split_fault
 from xew.sim_warp.changes.scenes import make_plan, make_scene, measure_progress
+from xew.sim_warp.devices.workers import Workers
 from xew.sim_warp.faults import FAULTS, draw_faults, get_fault, make_faulty
 from xew.sim_warp.generate import Args, generate
 from xew.sim_warp.inspection.checks import find_problem
@@ -22,6 +25,7 @@ from xew.sim_warp.inspection.pictures import describe
 from xew.sim_warp.plan import HOME, Timeline, ToolPath
 from xew.sim_warp.production import cells, seeds
 from xew.sim_warp.production.cells import Job, plan_cells, simulate_cells
+from xew.sim_warp.production.seeds import Family, family_key
 from xew.sim_warp.production.summary import fault_table, sort_faults, yield_table
 from xew.sim_warp.scene import Scene, scene_hash, scene_rng
 from xew.sim_warp.tasks import TASKS
@@ -72,6 +76,49 @@ def test_faults_are_drawn_by_scene_and_each_kind_before_any_comes_again(task: st
     assert len(set(drawn)) == len(drawn) >= 18 and len(set(names[:kinds])) == kinds >= 6
     assert drawn == draw_faults(TASKS[task].plan, scene_of(task)) != draw_faults(TASKS[task].plan, scene_of(task, 3))
     assert ("swap_objects" in names) == (task in SWAPPED or task in ("place_burger_fries", "place_dual_shoes"))
+
+
+DRAWN = {
+    "beat_block_hammer": 3451010659,
+    "blocks_ranking_rgb": 4000787397,
+    "grab_roller": 2690467557,
+    "lift_pot": 3142999783,
+    "open_laptop": 567603014,
+    "place_a2b_left": 3637080540,
+    "place_dual_shoes": 818452122,
+    "place_empty_cup": 1223637626,
+    "press_stapler": 1466489311,
+    "shake_bottle": 1532142456,
+    "stack_bowls_two": 713324013,
+}
+"""Checksums of the faults drawn for seed 2: data sets of earlier versions are completed with the same ones."""
+
+
+@pytest.mark.parametrize(("task", "checksum"), DRAWN.items())
+def test_the_drawn_faults_are_those_of_earlier_versions(task: str, checksum: int) -> None:
+    assert zlib.crc32(bytes(draw_faults(TASKS[task].plan, scene_of(task)))) == checksum
+
+
+def test_faults_are_drawn_in_workers_and_stay_in_the_order_of_families(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Backwards(InlineWorkers):
+        def run(self, function: Any, jobs: Sequence[Any]) -> Iterator[Any]:
+            yield from super().run(function, jobs[::-1])
+
+    monkeypatch.setattr(seeds.Family, "accepted_seeds", (2, 3))
+    asked = [Family(task, TEST_SEED_START, 2, ("piper",)) for task in ("stack_bowls_two", "place_empty_cup")]
+    families = seeds.plan_faults(asked, 8, cast(Workers, Backwards(1)))
+    expected = [(family.task, seed) for family in asked for seed in (2, 3)]
+    assert [(family.task, family.first_seed) for family in families] == expected
+    assert [family.faults for family in families] == [draw_faults(TASKS[t].plan, scene_of(t, s)) for t, s in expected]
+    assert {family.wanted for family in families} == {7}
+
+
+def test_records_find_their_families_by_key() -> None:
+    tests, faulty = Family("t", TEST_SEED_START, 2, ("a",)), seeds.FaultFamily("t", TEST_SEED_START + 1, 2, ("a",))
+    record = Record("t", TEST_SEED_START + 1, "a", True)
+    assert family_key(record) == tests.key
+    assert family_key(replace(record, seed=join_fault(3, record.seed))) == faulty.key != tests.key
+    assert family_key(replace(record, seed=1)) not in (tests.key, faulty.key)
 
 
 def at(path: ToolPath, seconds: float) -> int:

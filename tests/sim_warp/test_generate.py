@@ -334,7 +334,7 @@ def test_physics_on_the_cpu_leaves_the_gpu_to_the_pictures(
     monkeypatch.setattr(command, "make_scenes", lambda pool, jobs, production, _: productions.append(production) or [])
     work_inline(monkeypatch)
     args = Args((TASK,), ("a", "b"), out=tmp_path, batch=8, physics=physics)
-    with command.start_workers(args, dict.fromkeys("ab", WITH_SLOW[SLOW])) as make:
+    with command.start_workers(args, dict.fromkeys("ab", WITH_SLOW[SLOW])) as (_, make):
         assert list(make([Job(TASK, seed, ("a", "b")) for seed in range(5)])) == []
     (production,) = productions
     assert production.gpu_physics == (device != "cpu") and (production.batch, production.gpus) == (8, 2)

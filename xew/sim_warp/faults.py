@@ -280,10 +280,15 @@ def make_faulty(planner: Planner, scene: Scene, number: int) -> Timeline | None:
 
 def draw_faults(planner: Planner, scene: Scene) -> tuple[int, ...]:
     """Numbers of all faults that a scene's plan can have, in a drawn order: each kind before any kind comes again."""
+    expert = planner(scene)  # planned once: faults change copies
     order = scene_rng(f"faults of {scene.task}", scene.seed).permutation(len(FAULTS)) + 1
     turn: Counter[str] = Counter()
     turns: dict[int, int] = {}
     for number in map(int, order):
         name = FAULTS[number - 1].name
         turns[number], turn[name] = turn[name], turn[name] + 1
-    return tuple(number for number in sorted(turns, key=turns.__getitem__) if make_faulty(planner, scene, number) is not None)
+
+    def plan(other: Scene) -> Timeline:
+        return expert if other is scene else planner(other)
+
+    return tuple(number for number in sorted(turns, key=turns.__getitem__) if make_faulty(plan, scene, number) is not None)

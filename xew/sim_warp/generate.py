@@ -42,7 +42,16 @@ from xew.sim_warp.inspection.checks import render_views
 from xew.sim_warp.manifest import PACKAGED, Manifest, read_manifest
 from xew.sim_warp.production.cells import Job
 from xew.sim_warp.production.produce import Production, make_scenes
-from xew.sim_warp.production.seeds import MOST_UNPAIRED, Family, FaultFamily, demand_enough, plan_families, plan_faults
+from xew.sim_warp.production.seeds import (
+    MOST_UNPAIRED,
+    Family,
+    FamilyKey,
+    FaultFamily,
+    demand_enough,
+    family_key,
+    plan_families,
+    plan_faults,
+)
 from xew.sim_warp.production.summary import yield_table
 from xew.sim_warp.production.warm_up import compile_on_devices
 from xew.sim_warp.robots import ROBOTS, RobotSpec, adopt_robots, get_robot, is_path
@@ -50,6 +59,8 @@ from xew.sim_warp.tasks import TASKS, get_task
 
 Timed = tuple[list[Record], float]
 """Headers of one job's cells, and the workers' time for them [s]."""
+Make = Callable[[Sequence[Job]], Iterator[Timed]]
+"""Function that makes the scenes of jobs."""
 
 
 @dataclass(frozen=True)
@@ -111,15 +122,15 @@ class Args:
 
 
 @contextmanager
-def start_workers(args: Args, robots: Mapping[str, RobotSpec]) -> Iterator[Callable[[Sequence[Job]], Iterator[Timed]]]:
-    """Start worker processes with compiled kernels; yields the function that makes the scenes of jobs."""
+def start_workers(args: Args, robots: Mapping[str, RobotSpec]) -> Iterator[tuple[Workers, Make]]:
+    """Start worker processes with compiled kernels; yields them and the function that makes the scenes of jobs."""
     devices = find_devices(args.device)
     physics = choose_physics(args.physics, devices)
     production = Production(args.folder, robots, physics.is_cuda, args.batch, not args.states_only, len(devices))
     with Workers(args.workers or worker_count(devices, physics), devices) as workers:
         parts = {"physics": physics.alias, "kinematics": physics.alias, "rendering": devices[0].alias}
         wait_for_renderer = compile_on_devices(workers, parts, args.batch, later="rendering")
-        yield lambda jobs: make_scenes(workers, jobs, production, wait_for_renderer)
+        yield workers, lambda jobs: make_scenes(workers, jobs, production, wait_for_renderer)
 
 
 def generate(args: Args) -> list[Family]:
@@ -131,18 +142,16 @@ def generate(args: Args) -> list[Family]:
     teams = dict.fromkeys(SEED_STARTS, tuple(robots)) | dict.fromkeys(("test", "final"), tuple(tested))
     families = plan_seeds(args, teams, manifest)
     speed = _Speed()
-    with start_workers(args, {**robots, **tested}) as make:
+    with start_workers(args, {**robots, **tested}) as (workers, make):
         _complete(families, args, make, speed)
-        faulty = [more for family in families for more in plan_faults(family, args.faults)]
+        faulty = plan_faults(families, args.faults, workers) if args.faults > 1 else []
         if faulty:
             _complete(faulty, args, make, speed)
     speed.print()
     return [*families, *faulty]
 
 
-def _complete(
-    families: Sequence[Family], args: Args, make: Callable[[Sequence[Job]], Iterator[Timed]], speed: "_Speed"
-) -> None:
+def _complete(families: Sequence[Family], args: Args, make: Make, speed: "_Speed") -> None:
     """Make the missing episodes of some families, and add all records to them."""
     _read_existing(families, args)
     total = sum(family.wanted for family in families)
@@ -223,6 +232,9 @@ def _read_existing(families: Sequence[Family], args: Args) -> None:
             no videos, another kind of motion or another change.
     """
     out = args.folder
+    by_key: dict[FamilyKey, list[Family]] = {}
+    for family in families:
+        by_key.setdefault(family.key, []).append(family)
     for folder, record in find_records(out):
         if not record.videos and not args.states_only:
             raise EpisodeError(
@@ -234,16 +246,15 @@ def _read_existing(families: Sequence[Family], args: Args) -> None:
                 f"{out} holds episodes of {record.motion} motion, expected {args.motion} motion; choose another --out."
             )
         demand_change(folder, record, args.change)
-        for family in families:
+        for family in by_key.get(family_key(record), ()):
             if args.unpaired and record.robot not in family.robots:
                 continue
-            if family.holds(record):
-                if record.source:
-                    raise EpisodeError(
-                        f"{folder} was imported ({record.source}): its seed is not the scene of {record.task} here. "
-                        "Choose another --out."
-                    )
-                family.add(record)
+            if record.source:
+                raise EpisodeError(
+                    f"{folder} was imported ({record.source}): its seed is not the scene of {record.task} here. "
+                    "Choose another --out."
+                )
+            family.add(record)
 
 
 @dataclass

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from xew.episode import EpisodeError, Record
 from xew.protocol import SEED_STARTS, SHARED_MOTION, join_fault, seed_split, split_fault
 from xew.sim_warp.changes.scenes import change_of, make_scene
+from xew.sim_warp.devices.workers import Workers
 from xew.sim_warp.faults import draw_faults
 from xew.sim_warp.manifest import Manifest
 from xew.sim_warp.production.cells import Job
@@ -23,6 +24,16 @@ SEEDS_OF_ROBOT = 1000
 """Distance between the first seeds of two robots that share no scenes."""
 MOST_UNPAIRED = (SEEDS_OF_ROBOT - SPARE_TRIES) // TRIES_PER_SEED
 """Largest number of accepted seeds per robot that share no scenes."""
+
+
+FamilyKey = tuple[str, str | int]
+"""A task and a family of seeds, or of faulty cells their base seed."""
+
+
+def family_key(record: Record) -> FamilyKey:
+    """The key of the families that a cell is of (`Family.key`)."""
+    fault, base = split_fault(record.seed)
+    return record.task, base if fault else seed_split(base)
 
 
 @dataclass
@@ -41,10 +52,10 @@ class Family:
     """Change of new episodes, or RANDOM_CHANGE."""
     done: dict[int, dict[str, Record]] = field(default_factory=lambda: defaultdict(dict))
 
-    def holds(self, record: Record) -> bool:
-        """Whether a cell is of this task and family; faulty cells are of their scene's `FaultFamily`."""
-        fault, _ = split_fault(record.seed)
-        return not fault and record.task == self.task and seed_split(record.seed) == seed_split(self.first_seed)
+    @property
+    def key(self) -> FamilyKey:
+        """The key of its cells, which another robot's family may share."""
+        return self.task, seed_split(self.first_seed)
 
     def add(self, record: Record) -> None:
         """Add the record of a cell."""
@@ -100,10 +111,9 @@ class FaultFamily(Family):
     faults: tuple[int, ...] = ()
     """Numbers of faults in the order in which they are tried."""
 
-    def holds(self, record: Record) -> bool:
-        """Whether a cell is of this scene and has a fault."""
-        fault, base = split_fault(record.seed)
-        return bool(fault) and record.task == self.task and base == self.first_seed
+    @property
+    def key(self) -> FamilyKey:
+        return self.task, self.first_seed
 
     @property
     def tries(self) -> list[int]:
@@ -111,17 +121,23 @@ class FaultFamily(Family):
         return [join_fault(fault, self.first_seed) for fault in self.faults]
 
 
-def plan_faults(family: Family, variants: int) -> list[FaultFamily]:
-    """The faulty seeds of a family's accepted scenes; with the expert, each scene is to have `variants` commands."""
-    families = []
-    for seed in family.accepted_seeds if variants > 1 else ():
-        task = get_task(family.task)
-        faults = draw_faults(task.plan, make_scene(task, family.task, seed))
-        wanted = min(variants - 1, len(faults))
-        families.append(
-            FaultFamily(family.task, seed, wanted, family.robots, motion=family.motion, change=family.change, faults=faults)
-        )
-    return families
+def plan_faults(families: Sequence[Family], variants: int, workers: Workers) -> list[FaultFamily]:
+    """The faulty seeds of all accepted scenes; with the expert, each scene is to have `variants` commands."""
+    accepted = [(family, seed) for family in families for seed in family.accepted_seeds]
+    drawn = dict(workers.run(_draw_faults, [(family.task, seed) for family, seed in accepted]))
+    return [_fault_family(family, seed, drawn[family.task, seed], variants - 1) for family, seed in accepted]
+
+
+def _draw_faults(scene: tuple[str, int]) -> tuple[tuple[str, int], tuple[int, ...]]:
+    """A task and seed, and the faults of this scene, drawn in a worker process."""
+    name, seed = scene
+    task = get_task(name)
+    return scene, draw_faults(task.plan, make_scene(task, name, seed))
+
+
+def _fault_family(family: Family, seed: int, faults: tuple[int, ...], most: int) -> FaultFamily:
+    wanted = min(most, len(faults))
+    return FaultFamily(family.task, seed, wanted, family.robots, motion=family.motion, change=family.change, faults=faults)
 
 
 def plan_families(
