@@ -15,14 +15,24 @@ from matplotlib.figure import Figure
 
 from tests.analysis.conftest import FRAMES, SEEDS, TASKS, Study
 from tests.analysis.reports.browser import find_faults, needs_chromium
-from xew.analysis.report import Args, Picture, _strip_section, _write_explorer, main, ranking_tables, run_table
+from xew.analysis.report import (
+    Args,
+    Picture,
+    _count_expected,
+    _family,
+    _strip_section,
+    _write_explorer,
+    main,
+    ranking_tables,
+    run_table,
+)
 from xew.analysis.reports import charts
 from xew.analysis.reports.run_tables import Interval, RobotTable, Row
 from xew.analysis.reports.study_charts import run_chart
 from xew.analysis.scores import MetricInfo, read_scores
 from xew.analysis.tables import formats
 from xew.config import ConfigError
-from xew.episode import write_video
+from xew.episode import Record, write_video
 from xew.metrics import evaluate
 from xew.protocol import join_fault
 from xew.rollout import find_rollouts, read_rollout_video
@@ -313,6 +323,14 @@ def test_a_gain_over_almost_nothing_is_written_on_a_bar_that_ends() -> None:
     charts.bars(axes, ["render", "over almost nothing"], [("C0", values, np.full(2, np.nan))], "better by [%]")
     assert [text.get_text() for text in axes.texts] == ["80,600"]
     assert charts.LONGEST_BAR < axes.get_xlim()[1] < 1.1 * charts.LONGEST_BAR
+
+
+@pytest.mark.parametrize(("graded", "expected"), [((0, 1), 2), ((10_000_000,), 1), ((0, 20_000_000), 3), ((1_000_000,), 0)])
+def test_faulty_episodes_are_expected_where_any_was_graded(graded: tuple[int, ...], expected: int) -> None:
+    records = [Record("t", seed, "piper", True) for seed in (0, 1)]
+    records += [Record("t", 10_000_000, "piper", False, fault="push:40")]
+    records += [Record("t", 20_000_000, "piper", False, failure="physics", fault="push:60")]
+    assert _count_expected(records, ["piper"], {_family(seed) for seed in graded}) == expected
 
 
 def test_policies_are_ranked_in_a_table_of_their_own() -> None:

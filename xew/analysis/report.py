@@ -57,7 +57,7 @@ from xew.dataset import demand_one_change, demand_one_motion, find_records
 from xew.episode import Record, episode_folder, read_pixels
 from xew.files import hold_lock, write_bytes, write_text
 from xew.names import csv_text, plain_markdown
-from xew.protocol import BASELINES, HELD_OUT_ROBOTS, ROBOT_NAMES, seed_split
+from xew.protocol import BASELINES, HELD_OUT_ROBOTS, ROBOT_NAMES, seed_split, split_fault
 from xew.rollout import Rollout, find_rollouts, read_as_graded
 from xew.statistics import MIN_SCENES, find_parting, rank_policies, strict_metrics
 
@@ -224,7 +224,7 @@ def _make_tables(
     scores: Scores, records: Sequence[Record], held_out: Sequence[str]
 ) -> tuple[list[RobotTable], list[RobotTable]]:
     """A table for each held-out robot, never averaged over them; one for the seen robots pooled, as in the paper."""
-    present, families = set(scores.rows["robot"]), {seed_split(seed) for seed in scores.rows["seed"].unique()}
+    present, families = set(scores.rows["robot"]), {_family(seed) for seed in scores.rows["seed"].unique()}
 
     def build(title: str, robots: Sequence[str]) -> RobotTable:
         return robot_table(scores, title, robots, _count_expected(records, robots, families) if records else None)
@@ -235,11 +235,16 @@ def _make_tables(
     return apart, pooled
 
 
-def _count_expected(records: Sequence[Record], robots: Sequence[str], families: Collection[str]) -> int:
+def _count_expected(records: Sequence[Record], robots: Sequence[str], families: Collection[tuple[str, bool]]) -> int:
     """Episodes of these robots and families of seeds, in seeds that all robots have mastered: what a complete table has."""
     failed = {(record.task, record.seed) for record in records if not record.is_kept}
-    graded = [record for record in records if record.robot in robots and seed_split(record.seed) in families]
+    graded = [record for record in records if record.robot in robots and _family(record.seed) in families]
     return sum((record.task, record.seed) not in failed for record in graded)
+
+
+def _family(seed: int) -> tuple[str, bool]:
+    """The family of a seed, and whether it has a fault: rollouts may leave these out."""
+    return seed_split(seed), split_fault(seed)[0] > 0
 
 
 def _held_out_section(tables: Sequence[RobotTable], metrics: Sequence[MetricInfo]) -> Markup:
@@ -260,7 +265,7 @@ def _held_out_section(tables: Sequence[RobotTable], metrics: Sequence[MetricInfo
 
 def _caution_notes(tables: Sequence[RobotTable]) -> list[str]:
     few = min((table.count for table in tables), default=np.inf)
-    if few < MIN_SCENES:
+    if few < MIN_SCENES or any(row.is_few for table in tables for row in table.rows):
         return [f"Fewer than {MIN_SCENES} scenes: no intervals, and nothing is resolved."]
     return ["Fewer than ten episodes a robot: intervals and verdicts are rough."] if few < 10 else []
 

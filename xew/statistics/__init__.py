@@ -15,7 +15,7 @@ The package stands on the ground: it imports NumPy, SciPy and pandas, and nothin
     summary.py     means of a table by group of robots, and differences between its models
 """
 
-from xew.statistics.bootstrap import bootstrap_means, find_strata
+from xew.statistics.bootstrap import Units, bootstrap_means, find_strata
 from xew.statistics.correlation import every_draw, exact_p, interval_of_r, partial_r, pearson, permutation_p
 from xew.statistics.inference import DRAWS, LEVEL, SIGNIFICANCE, Component, Drawn, holm
 from xew.statistics.means import MIN_SCENES, Mean, Part, combine, fixed_mean, pool_runs
@@ -50,6 +50,7 @@ __all__ = [
     "Part",
     "RunSpread",
     "Summary",
+    "Units",
     "bootstrap_means",
     "combine",
     "describe_floors",

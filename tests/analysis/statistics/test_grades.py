@@ -8,7 +8,7 @@ from tests.analysis.synthetic_study import TASKS, paper_axes, write_study
 from xew.analysis.paper import read_paper
 from xew.analysis.scores import Scores, read_scores
 from xew.analysis.statistics.grades import SEEN, PaperGrades, StudyGrades, find_variant, relative_gain, relative_loss, row_keys
-from xew.protocol import PAPER_PARTS, PARTS, ROBOT_NAMES, SEEN_ROBOTS
+from xew.protocol import PAPER_PARTS, PARTS, ROBOT_NAMES, SEEN_ROBOTS, join_fault
 from xew.statistics import ASSUMED_SPREAD, Mean, bootstrap_means, combine, fixed_mean
 
 
@@ -54,6 +54,18 @@ def test_intervals_are_those_of_resampled_scenes(grades: StudyGrades, scores: Sc
     assert mean.values[1:].std() == pytest.approx(np.sqrt(within / 12), rel=0.06) and mean.freedom == 12 - 4
     low, high = mean.interval()
     assert low < mean.value < high
+
+
+def test_all_commands_in_a_scene_are_one_scene(grades: StudyGrades, scores: Scores) -> None:
+    """Faulty episodes that score as the expert's say no more: the interval stays as wide."""
+    rows = pd.concat([scores.rows.assign(seed=join_fault(fault, scores.rows["seed"])) for fault in range(3)])
+    faulty = StudyGrades(rows, scores.metrics, paper_axes(read_paper()), assumed_spread=0)
+    assert faulty.scenes == grades.scenes == 12
+    for robots, metric in ((SEEN, "lpips"), ("piper", "trajectory_error")):
+        mean, expert = (each.mean("fixed", "fixed", robots, metric) for each in (faulty, grades))
+        assert mean is not None and expert is not None
+        assert (mean.count, mean.scenes, mean.freedom) == (3 * expert.count, 12, expert.freedom)
+        assert mean.interval() == pytest.approx(expert.interval())
 
 
 @pytest.mark.parametrize("scenes", [6, 20, 100])

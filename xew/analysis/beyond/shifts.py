@@ -14,7 +14,7 @@ from xew.analysis.tables.labels import ROBOT_TITLES
 from xew.analysis.tables.table import Column, Table, TableCell, TableRow, TableSection, metric_title
 from xew.config import ConfigError
 from xew.protocol import FACTORS, PARTS
-from xew.statistics import LEVEL, Mean, combine, noise_floor, strict_metrics, verdict
+from xew.statistics import LEVEL, Mean, Units, combine, noise_floor, strict_metrics, verdict
 
 METRICS = ("lpips", "mask_iou", "pck", "trajectory_error")
 """Metrics of the table; a strict metric replaces the paper's."""
@@ -59,7 +59,7 @@ class Shifts:
         parts = [own.merge(common[SCENE].drop_duplicates(), on=SCENE), changed.merge(common, on=CELL)]
         merged = pd.concat(parts, ignore_index=True).assign(**{TRAINING: 0})
         self._grades = StudyGrades(merged, tuple(scores.metrics), {}, assumed_spread=0.0)
-        self.scenes = len(common[SCENE].drop_duplicates())
+        self.scenes = len(Units(common))
 
     def mean(self, model: str, case: str, metric: str) -> Mean | None:
         """Mean score in a case: a change on its training robots, an unseen robot, or empty for the training robots."""

@@ -46,6 +46,11 @@ class Row:
     """The same against the pasted render; empty where that was not graded, and for baselines."""
 
     @property
+    def is_few(self) -> bool:
+        """Whether it has too few scenes for an interval of any score."""
+        return bool(self.scores) and all(np.isnan(score.low) for score in self.scores.values())
+
+    @property
     def title(self) -> str:
         return " · ".join(filter(None, (BASELINES.get(self.model, self.model), self.condition)))
 
@@ -145,7 +150,7 @@ def progress(table: RobotTable, row: Row, metric: str) -> float | None:
 
 def _compare(row: Row, metrics: Sequence[MetricInfo]) -> str:
     """Sentences on a model compared with the frozen first frame and the paste baseline, by the metrics that decide."""
-    if all(np.isnan(score.low) for score in row.scores.values()):
+    if row.is_few:
         return f"cannot be compared with the frozen first frame: fewer than {MIN_SCENES} scenes were graded."
     text = f"{_compare_with('the frozen first frame', row.verdicts, metrics)}."
     return text + (f" It {_compare_with('the paste baseline', row.over_pasting, metrics)}." if row.over_pasting else "")

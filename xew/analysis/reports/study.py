@@ -47,6 +47,7 @@ from xew.analysis.tables.outside import outside_tables
 from xew.analysis.tables.table import MARKS, Table, parting_note
 from xew.names import csv_text, plain_markdown
 from xew.protocol import PAPER_PARTS
+from xew.statistics import Units
 
 TITLE = "Can the model render a robot that it has never seen?"
 PART_TITLES = {
@@ -252,7 +253,7 @@ def _part_section(content: Content, part: str) -> Markup | None:
 
 
 def _method_section(content: Content, scores: Scores) -> Markup:
-    made = {"scenes graded": str(len(scores.rows[["task", "seed"]].drop_duplicates())), **scores.measured_by}
+    made = {"scenes graded": str(len(Units(scores.rows))), **scores.measured_by}
     definitions = {metric.title: metric.reference for metric in scores.metrics}
     return page.section(
         METHOD,

@@ -11,7 +11,7 @@ runs of the variants with several, the anchors. The means of `PaperGrades` vary 
 
 from collections.abc import Mapping, Sequence
 from functools import cached_property
-from typing import ClassVar, Protocol
+from typing import ClassVar, Protocol, cast
 
 import numpy as np
 import pandas as pd
@@ -38,12 +38,12 @@ from xew.statistics import (
     LEVEL,
     Mean,
     RunSpread,
+    Units,
     bootstrap_means,
     combine,
     describe_floors,
     describe_power,
     find_spread,
-    find_strata,
     fixed_mean,
     floor_sources,
     largest_floor,
@@ -233,7 +233,8 @@ class StudyGrades:
         tasks, names_of = self._cells.index.get_level_values("task"), self._cells.columns.get_level_values("metric")
         for task, metric in find_powerless(self.power):
             self._cells = self._cells.mask(np.outer(tasks == task, names_of == metric))
-        self._strata = find_strata(self._cells.index.get_level_values("task").to_list())
+        units = Units(self._cells.index.to_frame(index=False))
+        self._numbers, self._strata = units.numbers(cast(pd.MultiIndex, self._cells.index)), units.strata
         self._columns: dict[tuple[str, str, str, int], int] = {}
         trainings: dict[str, set[int]] = {}
         names = self._cells.columns.to_frame(index=False).itertuples(index=False, name=None)
@@ -247,9 +248,9 @@ class StudyGrades:
         self._run_means: dict[tuple[tuple[str, ...], str], Mapping[str, Mapping[int, float]]] = {}
 
     @property
-    def scenes(self) -> list[tuple[str, int]]:
-        """(task, seed) of all that is graded."""
-        return self._cells.index.tolist()
+    def scenes(self) -> int:
+        """Number of scenes of all that is graded."""
+        return len(self._strata)
 
     @property
     def variants(self) -> list[str]:
@@ -339,11 +340,11 @@ class StudyGrades:
     def _bootstrap(
         self, variant: str, robots: tuple[str, ...], metrics: Sequence[str], scores: Sequence[np.ndarray]
     ) -> list[Mean | None]:
-        """The mean of each of some metrics' scores [k s r] of all trainings, scenes and some robots; None without any score."""
-        trainings, scenes, count = scores[0].shape
-        columns = np.stack([x.reshape(trainings, scenes * count) for x in scores], axis=-1)  # [k s*r m]
-        flat = columns.transpose(1, 2, 0).reshape(scenes * count, -1)
-        found = list(bootstrap_means(flat, np.repeat(np.arange(scenes), count), self._strata, self._draws))
+        """The mean of each of some metrics' scores [k s r] of all trainings, seeds and some robots; None without any score."""
+        trainings, rows, count = scores[0].shape
+        columns = np.stack([x.reshape(trainings, rows * count) for x in scores], axis=-1)  # [k s*r m]
+        flat = columns.transpose(1, 2, 0).reshape(rows * count, -1)
+        found = list(bootstrap_means(flat, np.repeat(self._numbers, count), self._strata, self._draws))
         seeds = self._trainings.get(variant, (0,))
         means: list[Mean | None] = []
         for i, metric in enumerate(metrics):
@@ -371,7 +372,7 @@ class StudyGrades:
         return {seed: float(np.nanmean(own)) for seed, own in runs if not np.isnan(own).all()}
 
     def _scores(self, variant: str, robots: tuple[str, ...], metric: str) -> np.ndarray:
-        """Scores [k s r] of all trainings and scenes, NaN where there is none; also where another of the trainings has none."""
+        """Scores [k s r] of all trainings and seeds, NaN where there is none; also where another of the trainings has none."""
         empty, found = np.full(len(self._cells), np.nan), []
         for training in self._trainings.get(variant, (0,)):
             columns = [self._columns.get((variant, robot, metric, training)) for robot in robots]

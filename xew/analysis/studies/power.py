@@ -79,7 +79,7 @@ def format_power(path: Path) -> str:
     asked = _list_claims(reader)
     if not asked:
         raise ConfigError(f"{path} has no scores that a claim asks for, so it says nothing about the data that claims need.")
-    count, most = len(grades.scenes), TASK_COUNT * TEST_SEEDS_PER_TASK
+    count, most = grades.scenes, TASK_COUNT * TEST_SEEDS_PER_TASK
     lines = [
         f"power: probability of a verdict on each claim, if effects and spreads are as in {path}",
         f"{'training runs of each variant':<36}" + "".join(f"{runs:>6}" for runs in RUNS),
