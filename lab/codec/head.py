@@ -127,7 +127,7 @@ def pack(args: Pack) -> None:
     """Write the groups of a data set, or of its rollouts; episodes are read in as many processes as there are cores."""
     episodes = [
         (folder, record)
-        for folder, record in read_dataset(args.data).select(robots=expand_robots(args.robots), split="train")
+        for folder, record in read_dataset(args.data).select(robots=expand_robots(args.robots), split="train", faults=False)
         if args.rollouts is None or (_rollout(args, record) / "rgb.mkv").exists()
     ]
     counts = [len(list_starts(record.frame_count, record.seed, args.every)) for _, record in episodes]

@@ -12,11 +12,11 @@ Seeds = Literal["train", "test"]
 
 
 def select_unpaired(dataset: Dataset, robots: Collection[str], seeds: Seeds) -> list[Episode]:
-    """Sorted episodes with videos of some robots and a seed family, including seeds at which another robot failed."""
+    """Sorted experts' episodes with videos of some robots and a seed family, including seeds at which another robot failed."""
     return [
         (folder, record)
         for folder, record in dataset.cells
-        if record.is_kept and record.videos and record.robot in robots and seed_split(record.seed) == seeds
+        if record.is_kept and not record.fault and record.videos and record.robot in robots and seed_split(record.seed) == seeds
     ]
 
 

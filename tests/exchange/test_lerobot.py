@@ -118,16 +118,24 @@ def test_an_episode_carries_its_change(data: Path, exported: Path, tmp_path: Pat
     assert "xew/change" not in parquet.read_table(exported / "meta/episodes").column_names
 
 
-def test_an_episode_carries_its_fault_and_its_outcome(data: Path, exported: Path, tmp_path: Path) -> None:
+def test_faulty_episodes_are_exported_if_asked_with_their_fault_and_outcome(
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     outcomes = {"": True, "stop:30": False}
     for (folder, record), (fault, success) in zip(find_accepted(data), outcomes.items(), strict=False):
         faulty = replace(record, fault=fault, success=success, progress=0.5 if fault else None)
         write_episode(tmp_path / "data", faulty, read_states(folder), read_video(folder / "rgb.mkv"))
-    export(Args(tmp_path / "data", tmp_path / "out"))
+    export(Args(tmp_path / "data", tmp_path / "out", faults=True))
     assert parquet.read_table(tmp_path / "out/meta/episodes")["xew/fault"].to_pylist() == list(outcomes)
     rows = parquet.read_table(tmp_path / "out/data").to_pandas().groupby("episode_index")
     assert rows["next.success"].sum().tolist() == [1, 0] and rows["next.done"].sum().tolist() == [1, 1]
-    assert "xew/fault" not in parquet.read_table(exported / "meta/episodes").column_names
+    assert "omitted" not in capsys.readouterr().out
+    assert export(Args(tmp_path / "data", tmp_path / "demonstrations"))[0] == 1
+    assert "omitted: 1 episodes of faulty commands, which --faults exports too" in capsys.readouterr().out
+    demonstrations = parquet.read_table(tmp_path / "demonstrations/meta/episodes")
+    assert "xew/fault" not in demonstrations.column_names and len(demonstrations) == 1
+    with pytest.raises(EpisodeError, match="no episode of these robots"):
+        export(Args(tmp_path / "data", tmp_path / "none", robots=(faulty.robot,)))
 
 
 def test_a_red_block_stays_red(tmp_path: Path) -> None:

@@ -9,12 +9,12 @@ Writes DIR: meta/ (info, tasks, episodes, statistics), data/ (parquet, many epis
     observation.images.cam_…      with --views, one video a camera by RoboTwin's names (CAMERA_NAMES)
     next.done, next.success       true at the last frame; next.success only if the task is solved
 The table of episodes has each episode's robot, task, seed and kind of motion (columns xew/…), in changed scenes xew/change, and
-with faults xew/fault.
+with --faults xew/fault.
 A feature that an imported episode lacks is omitted for the whole set. `fps` is the episodes' frame rate, 50 / 3 in simulated
 data; a set has one rate. Video is lossy; all other data are exact.
 
 Command: python -m xew.exchange.lerobot DATA --out DIR [--views head wrist_left wrist_right --robots … --tasks …
-    --split train --robot-video]
+    --split train --robot-video --faults]
 """
 
 import json
@@ -76,6 +76,8 @@ class Args:
     """Tasks to export; default: all in the data."""
     split: Literal["train", "validation", "test", "final"] | None = None
     """Family of seeds; default: all. Export the training seeds to train on the set and grade on xew's test seeds."""
+    faults: bool = False
+    """Also export the episodes of faulty commands, most of which are no demonstrations of success."""
     views: tuple[str, ...] = ()
     """Views, each with a video of its own; default: the head camera as observation.images.head."""
     robot_video: bool = False
@@ -138,7 +140,10 @@ def _select_episodes(args: Args) -> list[tuple[Path, Record]]:
     ):
         if missing := sorted(set(asked) - known):
             raise EpisodeError(f"{flag} {', '.join(missing)}: not in {args.data}; it has {', '.join(sorted(known))}.")
-    chosen = dataset.select(robots=robots or None, tasks=args.tasks or None, split=args.split)
+    selected = dataset.select(robots=robots or None, tasks=args.tasks or None, split=args.split)
+    chosen = [(folder, record) for folder, record in selected if args.faults or not record.fault]
+    if left_out := len(selected) - len(chosen):
+        print(f"omitted: {left_out} episodes of faulty commands, which --faults exports too")
     if not chosen:
         raise EpisodeError(f"{args.data} has no episode of these robots, tasks and seeds; relax the selection.")
     return chosen

@@ -31,7 +31,7 @@ from xew.model.cache.store import LatentCache, load_codec
 from xew.model.codecs.ceiling import check_lpips, choose_evenly, measure_ceiling
 from xew.model.codecs.contract import Codec
 from xew.model.conditions import shown_scene
-from xew.model.episodes.choice import replay_episodes, training_episodes
+from xew.model.episodes.choice import mixed_episodes, training_episodes
 from xew.model.episodes.commands import episode_command
 from xew.model.experiment import Experiment, parse_experiment
 from xew.model.settings.settings import Clip
@@ -96,7 +96,7 @@ def encode_experiment(experiment: Experiment, source: PixelSource = stored_pixel
         with ThreadPoolExecutor(1) as thread:
             # Where processes read, and others encode on several GPUs, this one measures the ceiling meanwhile.
             measured = thread.submit(measure) if jax.default_backend() != "cpu" and processes != 1 else None
-            written = encode_episodes(cache, [*episodes, *replay_episodes(dataset, choice)], source, batch, processes)
+            written = encode_episodes(cache, [*episodes, *mixed_episodes(dataset, choice)], source, batch, processes)
             ceiling = measured.result() if measured else measure()
         header = {"version": CACHE_VERSION, "codec": codec.decoder_hash, "clip": asdict(experiment.clip)}
         header |= {"streams": list(cache.streams), "episodes": len(episodes), "ceiling": ceiling}
@@ -115,7 +115,7 @@ def report_ceiling(
     It is measured once for a cache; its header lists the videos.
     """
     robots = validation_split(experiment.robots)
-    validation = dataset.select(robots=(*robots.train_robots, *robots.held_out_robots), split="validation")
+    validation = dataset.select(robots=(*robots.train_robots, *robots.held_out_robots), split="validation", faults=False)
     chosen = choose_evenly(validation or episodes, CEILING_CLIPS)
     on = "validation seeds" if validation else "training episodes, for there are no validation seeds"
     hashes = [record.hashes["rgb"] for _, record in chosen]

@@ -161,6 +161,8 @@ class Args:
     """Seed family; use validation seeds for tuning."""
     robots: tuple[str, ...] = ()
     """Robots to predict (default: all in the data)."""
+    faults: bool = True
+    """Predict episodes of faulty commands too, where the data hold them."""
     max_frames: int = 0
     """Number of frames to predict of each episode; 0 predicts all."""
     condition: str = ""
@@ -183,7 +185,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     name = args.model.rpartition(":")[2]
     out = args.out or Path("rollouts") / name
     check_out(out, args.data)
-    episodes = select_episodes(view_folder(args.data, args.view), args.split, args.robots or None)
+    episodes = select_episodes(view_folder(args.data, args.view), args.split, args.robots or None, args.faults)
     items = [(e, common_header(name, args.condition, e[1], args.max_frames) | {"outside": args.model}) for e in episodes]
     pending = [item for item in items if not is_done(out, *item)]
     model = load_model(args.model)

@@ -104,6 +104,8 @@ class Flags:
     """Seed family; use validation seeds for tuning."""
     robots: tuple[str, ...] = ()
     """Robots to predict (default: all in the data)."""
+    faults: bool = True
+    """Predict episodes of faulty commands too, where the data hold them."""
     out: Path | None = None
     """Folder to write to (default: rollouts/<name of the run>)."""
     trust: tuple[str, ...] = ()
@@ -148,7 +150,7 @@ def predict_pending(
     take_memory_as_needed()
     data, out = flags.data or experiment.data, flags.out or out or Path("rollouts") / default_name(run)
     check_out(out, data)
-    episodes = select_episodes(view_folder(data, experiment.view), flags.split, flags.robots or None)
+    episodes = select_episodes(view_folder(data, experiment.view), flags.split, flags.robots or None, flags.faults)
     step = find_step(run, flags.checkpoint)
     saved = None if step is None else checkpoint_time(run, step)
     headers = [(episode, rollout_header(experiment, step, saved, episode) | dict(extra or {})) for episode in episodes]

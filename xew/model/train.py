@@ -105,16 +105,16 @@ def train(experiment: Experiment, *, resume: bool = False, overwrite: bool = Fal
     own = process_samples(mesh, experiment.train.batch)
     check_start(experiment)
     episodes = choose_episodes(read_dataset(experiment.episodes), experiment.choice)
-    source = ClipSource.open(experiment.encoding, experiment.instructions, episodes.fresh, episodes.replay)
+    source = ClipSource.open(experiment.encoding, experiment.instructions, episodes.fresh, episodes.mixed)
     source.check()
     spec = experiment.spec.with_steps(source.fresh)
     settings = spec.settings
     codec = source.cache.codec
-    batches = iter(make_dataset(source, settings.batch, settings.seed, spec.replay, own))
+    batches = iter(make_dataset(source, settings.batch, settings.seed, spec.mixed, own))
     trainer = make_trainer(spec, mesh, codec)
     check_memory(estimate_memory(trainer, experiment.encoding), ignore=ignore_memory)
 
-    trained = (*episodes.fresh, *episodes.replay)
+    trained = (*episodes.fresh, *episodes.mixed)
     source.scales = begin_run(experiment, codec, source.scales, trained, resume=resume, overwrite=overwrite)
     timetable = Timetable(
         settings.steps, settings.log_every, settings.save_every, sample_steps(settings), learning_rate(settings)

@@ -26,6 +26,7 @@ from xew.analysis.studies.runner import Budget, StudyRunner, complete_command
 from xew.analysis.studies.status import exit_with_failures
 from xew.config import ConfigError, read_yaml
 from xew.episode import EpisodeError
+from xew.protocol import join_fault
 
 pytestmark = pytest.mark.usefixtures("cheap_steps")
 
@@ -402,7 +403,13 @@ def test_data_beyond_the_study_is_an_error(study: Study) -> None:
     said = StudyRunner(only, {}, Ledger(study.out), ThisMachine((), 1, {}), {})._check_data(study.data_folder)
     assert "also holds open_laptop, franka_panda, 1 more train seeds a task" in said
     fitting = replace(study, tasks=("place_empty_cup", "open_laptop"), train_seeds=2)
-    assert StudyRunner(fitting, {}, Ledger(study.out), ThisMachine((), 1, {}), {})._check_data(study.data_folder) == ""
+    fits = StudyRunner(fitting, {}, Ledger(study.out), ThisMachine((), 1, {}), {})
+    assert fits._check_data(study.data_folder) == ""
+    for base, said in ((0, ""), (1_000_000, "also holds faulty test episodes")):
+        for folder in write_synthetic_data(study.data_folder, seeds=(join_fault(3, base),), frames=3):
+            header = json.loads((folder / "episode.json").read_text())
+            (folder / "episode.json").write_text(json.dumps(header | {"fault": "stop:5", "progress": 1.0}))
+        assert said in fits._check_data(study.data_folder) and bool(said) == bool(fits._check_data(study.data_folder))
 
 
 def test_a_folder_that_cannot_be_written(tmp_path: Path) -> None:

@@ -9,10 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from xew.config import ConfigError
 from xew.dataset import Dataset, demand_one_motion
 from xew.episode import EpisodeError, Record
 from xew.model import latents
 from xew.model.codecs.ceiling import Ceiling
+from xew.model.episodes import choice
 from xew.model.episodes.choice import choose_episodes, sample_episodes, training_episodes
 from xew.model.settings.parts import EpisodeChoice, sample_roles
 from xew.model.settings.settings import Clip
@@ -24,6 +26,7 @@ from xew.protocol import (
     SPLITS,
     TEST_SEED_START,
     VALIDATION_SEED_START,
+    join_fault,
     seed_split,
 )
 
@@ -57,15 +60,52 @@ def test_nothing_is_trained_on_validation_or_test_seeds() -> None:
     assert {seed_split(record.seed) for _, record in episodes} == {"train"}
 
 
+def with_faults(*families: str) -> Dataset:
+    """All families, and of each scene of some of them an episode of faulty commands too."""
+    whole, faulty = dataset(*FAMILIES), dataset(*families)
+    of_faults = [replace(r, seed=join_fault(3, r.seed), success=False, fault="stop:5", progress=0.4) for _, r in faulty.cells]
+    return Dataset(whole.root, (*whole.cells, *((Path("data") / str(r.seed) / r.robot, r) for r in of_faults)))
+
+
+def test_faulty_episodes_of_training_seeds_are_mixed_in_where_asked() -> None:
+    data, asked = with_faults(*FAMILIES), EpisodeChoice(FIXED.train_robots, samples=sample_roles(FIXED))
+    without, mixing = choose_episodes(data, asked), choose_episodes(data, replace(asked, faults=True))
+    assert without == choose_episodes(dataset(*FAMILIES), asked) and without.mixed == []
+    assert (mixing.fresh, mixing.samples) == (without.fresh, without.samples)
+    assert {(record.seed, record.robot) for _, record in mixing.mixed} == {
+        (join_fault(3, seed), robot) for seed in range(2) for robot in FIXED.train_robots
+    }
+
+
+def test_few_shots_are_the_experts() -> None:
+    asked = EpisodeChoice(("piper",), shots=2)
+    assert [record.seed for _, record in training_episodes(with_faults("train"), asked)] == [0, 1]
+    with pytest.raises(ConfigError, match="there are only 2 training episodes of piper"):
+        training_episodes(with_faults("train"), replace(asked, shots=3))
+
+
+def test_mixing_in_needs_faulty_episodes_of_training_seeds() -> None:
+    with pytest.raises(ConfigError, match=r"data has no training episode of faulty commands; make some: .* --faults 8 --out"):
+        choose_episodes(with_faults("validation", "test"), EpisodeChoice(FIXED.train_robots, faults=True))
+
+
+@pytest.mark.parametrize(("faults", "count"), [(True, 4), (False, 2)])
+def test_rollouts_take_faulty_episodes_in_or_leave_them_out(faults: bool, count: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(choice, "read_dataset", lambda data: with_faults("test"))
+    chosen = choice.select_episodes(Path("data"), "test", ["piper"], faults)
+    assert len(chosen) == count and {seed_split(record.seed) for _, record in chosen} == {"test"}
+    assert len([record for _, record in chosen if record.fault]) == count - 2
+
+
 @pytest.mark.parametrize(("robot", "rate"), [("ur5_wsg", 25.0), ("arx_x5", 250 / 14)])
 def test_training_refuses_mixed_frame_rates(robot: str, rate: float) -> None:
     """Imported episodes of several rates, also where only replayed ones have the other."""
     whole = dataset("train", "test", robots=ROBOT_NAMES)
     cells = [(path, replace(record, frame_rate=rate) if record.robot == robot else record) for path, record in whole.cells]
-    choice = EpisodeChoice(("ur5_wsg",), replay=("arx_x5",))
-    assert len(choose_episodes(whole, choice).replay) == 2
+    asked = EpisodeChoice(("ur5_wsg",), replay=("arx_x5",))
+    assert len(choose_episodes(whole, asked).mixed) == 2
     with pytest.raises(EpisodeError, match=rf"data has episodes at 16.67 \(2\) and at {rate:.2f} \(2\) frames per second"):
-        choose_episodes(Dataset(whole.root, tuple(cells)), choice)
+        choose_episodes(Dataset(whole.root, tuple(cells)), asked)
 
 
 def test_motion_is_never_mixed() -> None:

@@ -116,10 +116,13 @@ class StudyRunner:
         study, accepted = self.study, [record for _, record in find_accepted(data)]
         tasks, robots = ({getattr(record, name) for record in accepted} for name in ("task", "robot"))
         beyond = sorted(tasks - set(study.tasks or tasks)) + sorted(robots - set(study.robot_keys))
+        experts = [record for record in accepted if not record.fault]  # a model learns from others only by train.faults
         for family, wanted in (("train", study.train_seeds), (study.test_family, study.test_seeds)):
-            seeds = {(record.task, record.seed) for record in accepted if seed_split(record.seed) == family}
+            seeds = {(record.task, record.seed) for record in experts if seed_split(record.seed) == family}
             more = max((len([1 for task, _ in seeds if task == name]) for name in tasks), default=0) - wanted
             beyond += [f"{more} more {family} seeds a task"] if more > 0 else []
+        if any(record.fault and seed_split(record.seed) == study.test_family for record in accepted):
+            beyond.append(f"faulty {study.test_family} episodes")
         found = ", ".join(beyond)
         return f"{data} also holds {found}; name them in the study, or give it its own data" if found else ""
 

@@ -17,8 +17,8 @@ class TrainingEpisodes:
 
     fresh: list[Episode]
     """Training episodes."""
-    replay: list[Episode]
-    """Replayed training episodes of the run that an adaptation starts from."""
+    mixed: list[Episode]
+    """Training episodes that a part of every batch is drawn from (`mixed_episodes`)."""
     samples: dict[str, Episode]
     """Episodes of sample videos, by role and robot."""
 
@@ -30,13 +30,13 @@ def choose_episodes(dataset: Dataset, choice: EpisodeChoice) -> TrainingEpisodes
         ConfigError, EpisodeError: there are no or too few training episodes, or they have several frame rates.
     """
     samples = sample_episodes(dataset, choice.samples, choice.motion)
-    fresh, replay = training_episodes(dataset, choice), replay_episodes(dataset, choice)
-    demand_one_rate(dataset.root, (record for _, record in (*fresh, *replay)))
-    return TrainingEpisodes(fresh, replay, samples)
+    fresh, mixed = training_episodes(dataset, choice), mixed_episodes(dataset, choice)
+    demand_one_rate(dataset.root, (record for _, record in (*fresh, *mixed)))
+    return TrainingEpisodes(fresh, mixed, samples)
 
 
 def training_episodes(dataset: Dataset, choice: EpisodeChoice) -> list[Episode]:
-    """Training episodes of the training robots, or the first few (`shots`) of the robots to adapt to.
+    """The expert's training episodes of the training robots, or the first few (`shots`) of the robots to adapt to.
 
     Raises:
         ConfigError: there are none or, in an adaptation, too few of a robot.
@@ -45,13 +45,23 @@ def training_episodes(dataset: Dataset, choice: EpisodeChoice) -> list[Episode]:
     return _select_training(dataset, choice.robots, choice.motion, shots=choice.shots, need_all=choice.shots > 0)
 
 
-def replay_episodes(dataset: Dataset, choice: EpisodeChoice) -> list[Episode]:
-    """Replayed episodes of an adaptation: training episodes of the run that it starts from. Raises as `training_episodes`."""
-    return _select_training(dataset, choice.replay, choice.motion, need_all=True) if choice.replay else []
+def mixed_episodes(dataset: Dataset, choice: EpisodeChoice) -> list[Episode]:
+    """Episodes of which every batch has a part: the faulty ones of the training seeds, or those that an adaptation replays,
+    which are training episodes of the run that it starts from. Raises as `training_episodes`.
+    """
+    if choice.replay:
+        return _select_training(dataset, choice.replay, choice.motion, need_all=True)
+    faulty = dataset.select(robots=choice.robots, split="train", motion=choice.motion, faults=True) if choice.faults else []
+    if choice.faults and not faulty:
+        raise ConfigError(
+            f"train.faults is set, and {dataset.root} has no training episode of faulty commands; make some: python -m "
+            f"xew.sim_warp.generate --faults 8 --out {dataset.root}, or set train.faults to 0."
+        )
+    return faulty
 
 
 def _select_training(dataset: Dataset, robots: Sequence[str], motion: str, *, shots: int = 0, need_all: bool) -> list[Episode]:
-    chosen = dataset.select(robots=robots, split="train", motion=motion)
+    chosen = dataset.select(robots=robots, split="train", motion=motion, faults=False)
     if shots:
         chosen = first_of_each(chosen, shots)
     missing = [robot for robot in robots if robot not in {record.robot for _, record in chosen}]
@@ -75,15 +85,18 @@ def first_of_each(episodes: Sequence[Episode], count: int) -> list[Episode]:
 
 
 def sample_episodes(dataset: Dataset, roles: Mapping[str, str], motion: str | None = None) -> dict[str, Episode]:
-    """An episode with videos of each of these robots, by role and robot: of a validation seed, else of a training seed."""
-    robots = tuple(roles)
-    candidates = [e for family in ("validation", "train") for e in dataset.select(robots=robots, split=family, motion=motion)]
+    """The expert's episode with videos of each of these robots, by role and robot: of a validation, else a training seed."""
+    candidates = [
+        episode
+        for family in ("validation", "train")
+        for episode in dataset.select(robots=tuple(roles), split=family, motion=motion, faults=False)
+    ]
     first = {record.robot: (folder, record) for folder, record in reversed(candidates) if record.videos}
     return {f"{roles[robot]}/{robot}": first[robot] for robot in roles if robot in first}
 
 
-def select_episodes(data: Path, split: str, robots: Sequence[str] | None = None) -> list[Episode]:
-    """Accepted episodes of a seed family and of the given robots, by default all.
+def select_episodes(data: Path, split: str, robots: Sequence[str] | None = None, faults: bool = True) -> list[Episode]:
+    """Accepted episodes of a seed family and of the given robots, by default all; without `faults` the experts' alone.
 
     Raises:
         ConfigError, EpisodeError: there are none, or they have both kinds of motion.
@@ -93,7 +106,7 @@ def select_episodes(data: Path, split: str, robots: Sequence[str] | None = None)
     missing = [robot for robot in robots or () if robot not in dataset.robots]
     if missing:
         raise explain_missing_robots(dataset, missing)
-    chosen = dataset.select(robots=robots, split=split)
+    chosen = dataset.select(robots=robots, split=split, faults=None if faults else False)
     if not chosen:
         asked = f"{split} episode of {', '.join(robots)}" if robots else f"{split} episode"
         seeds = " --validation-seeds 4" if split == "validation" else ""

@@ -77,6 +77,8 @@ class EpisodeChoice:
     """Number of episodes of each task and robot in an adaptation; 0 takes all."""
     replay: tuple[str, ...] = ()
     """Replayed robots of an adaptation."""
+    faults: bool = False
+    """Whether faulty episodes are mixed in."""
     samples: Mapping[str, str] = field(default_factory=dict)
     """Roles (seen, unseen or target) of the robots in sample videos."""
     motion: str = SHARED_MOTION
@@ -90,8 +92,8 @@ class TrainSpec:
     network: Network
     inputs: ClipInputs
     settings: TrainSettings
-    replay: float = 0.0
-    """Replayed part of every batch of an adaptation."""
+    mixed: float = 0.0
+    """Part of every batch from replayed or faulty episodes."""
     lora_rank: int = 0
     """Rank of the LoRA corrections; 0 trains all weights."""
 
@@ -100,8 +102,8 @@ class TrainSpec:
         return make_optimizer(self.settings)
 
     def with_steps(self, samples: int) -> "TrainSpec":
-        """The same with `steps` set for this number of new (not replayed) training samples."""
-        return replace(self, settings=set_steps(self.settings, samples, self.replay))
+        """The same with `steps` set for this number of fresh training samples."""
+        return replace(self, settings=set_steps(self.settings, samples, self.mixed))
 
 
 def pick_conditions(settings: ModelSettings) -> list[Condition]:

@@ -3,7 +3,7 @@
 import grain
 import numpy as np
 
-from xew.model.settings.settings import count_replayed
+from xew.model.settings.settings import count_mixed
 from xew.model.training.data import Batch, ClipSource, stack
 
 PASSES = 2**40
@@ -11,7 +11,7 @@ PASSES = 2**40
 
 
 def make_dataset(
-    source: ClipSource, batch: int, seed: int, replay: float = 0.0, own: np.ndarray | None = None
+    source: ClipSource, batch: int, seed: int, mixed: float = 0.0, own: np.ndarray | None = None
 ) -> grain.IterDataset:
     """Make endless shuffled batches, whose iterator has get_state and set_state; independent of the number of processes.
 
@@ -19,17 +19,17 @@ def make_dataset(
         source: of the samples.
         batch: number of samples over all processes.
         seed: of the order.
-        replay: part of each batch from the source's replayed episodes.
+        mixed: part of each batch from the source's replayed or faulty episodes.
         own: [b] indices of the samples of each batch that this process loads, by default all.
     """
-    count = count_replayed(batch, replay)
+    count = count_mixed(batch, mixed)
     fresh = _shuffle(range(source.fresh), seed, batch - count)
-    replayed = _shuffle(range(source.fresh, len(source)), seed + 1, count) if count else None
+    others = _shuffle(range(source.fresh, len(source)), seed + 1, count) if count else None
     own = np.arange(batch) if own is None else own
 
     def load(number: int, indices: np.ndarray) -> Batch:
-        if replayed is not None:
-            indices = np.concatenate([indices, replayed[number]])
+        if others is not None:
+            indices = np.concatenate([indices, others[number]])
         return stack([source[int(index)] for index in indices[own]])
 
     dataset = fresh.map_with_index(load)
