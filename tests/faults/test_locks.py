@@ -149,7 +149,7 @@ def test_a_rollout_into_a_folder_that_another_writes_ends_in_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
     data, out = tmp_path / "data", tmp_path / "out"
-    flags = SimpleNamespace(data=data, out=out, checkpoint=None, split="test", robots=())
+    flags = SimpleNamespace(data=data, out=out, checkpoint=None, split="test", robots=(), faults=True)
     experiment = SimpleNamespace(instructions=SimpleNamespace(encode=list), view="head")
     monkeypatch.setattr(rollout, "parse_rollout", lambda *_: (tmp_path / "run", flags, experiment))
     monkeypatch.setattr(rollout, "select_episodes", lambda *_: [])
