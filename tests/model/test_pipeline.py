@@ -1,6 +1,7 @@
 """Latents, training, resuming and rollouts on synthetic data, end to end and tiny."""
 
 import ast
+import itertools
 import json
 import os
 import shutil
@@ -29,8 +30,10 @@ from xew.model.episodes.choice import training_episodes
 from xew.model.experiment import Experiment, load_experiment
 from xew.model.runs.log import RunLog
 from xew.model.runs.roundtrip import open_roundtrip
+from xew.model.training import order
 from xew.model.training.data import ClipSource, fake_batch
 from xew.model.training.order import make_dataset
+from xew.model.training.step import as_float32
 from xew.protocol import SEEN_ROBOTS, CameraSpec
 from xew.rollout import find_rollouts, read_rollout_video
 from xew.sim_warp.inspection.checks import tile_views
@@ -247,6 +250,21 @@ def test_batches_have_the_declared_shapes_and_resume(experiment: Experiment) -> 
     continued = iter(make_dataset(source, 2, seed=0))
     continued.set_state(position)
     np.testing.assert_array_equal(next(continued).latents, second.latents)
+
+
+def test_batches_do_not_depend_on_the_number_of_threads_and_keep_the_type_on_disk(
+    experiment: Experiment, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    episodes = training_episodes(read_dataset(experiment.data), experiment.choice)
+    source = ClipSource.open(experiment.encoding, experiment.instructions, episodes)
+    read = []
+    for threads in (1, 8):
+        monkeypatch.setattr(order, "usable_cores", lambda threads=threads: threads)
+        read.append(list(itertools.islice(make_dataset(source, 2, seed=0), 4)))
+    for one, other in zip(*read, strict=True):
+        np.testing.assert_array_equal(one.latents, other.latents)
+        np.testing.assert_array_equal(one.text, other.text)
+    assert one.latents.dtype == np.float16 and as_float32(one).latents.dtype == np.float32
 
 
 def test_threads_parse_no_python(experiment: Experiment, monkeypatch: pytest.MonkeyPatch) -> None:

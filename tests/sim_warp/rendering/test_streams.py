@@ -312,16 +312,13 @@ def test_threads_share_one_renderer_and_wait_until_it_is_made(monkeypatch: pytes
     """Warp hands out a GPU before its streams are there, so that a second renderer at that moment ends in an error."""
     made: list[object] = []
 
-    def make() -> object:
+    def make(frames_per_chunk: int | None) -> object:
         time.sleep(0.02)
-        made.append(object())
-        return made[-1]
+        made.append(frames_per_chunk)
+        return object()
 
     monkeypatch.setattr(streams, "Renderer", make)
-    streams._make_default_renderer.cache_clear()
-    try:
-        with ThreadPoolExecutor(4) as pool:
-            found = list(pool.map(lambda _: default_renderer(), range(4)))
-    finally:
-        streams._make_default_renderer.cache_clear()
-    assert len(made) == 1 and set(found) == set(made)
+    monkeypatch.setattr(streams, "_shared", [])
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(lambda _: default_renderer(96), range(4)))
+    assert made == [96] and len(set(found)) == 1

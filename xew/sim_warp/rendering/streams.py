@@ -65,15 +65,15 @@ class CommandStreams:
     """[t h w 2] float32 motion from this frame to the next [pixels], see `Frames.optical_flow`."""
 
 
-def default_renderer() -> Renderer:
-    """The process's shared renderer on Warp's default device, created at first use."""
-    with PARSING:  # Warp's devices and `cache` are not thread-safe at first use
-        return _make_default_renderer()
+def default_renderer(frames_per_chunk: int | None = None) -> Renderer:
+    """The process's shared renderer on Warp's default device; the first call creates it, with so many frames in flight."""
+    with PARSING:  # Warp's devices are not thread-safe at first use
+        if not _shared:
+            _shared.append(Renderer(frames_per_chunk=frames_per_chunk))
+        return _shared[0]
 
 
-@cache
-def _make_default_renderer() -> Renderer:
-    return Renderer()
+_shared: list[Renderer] = []
 
 
 def command_streams(robot: RobotSpec, action: np.ndarray, camera: Camera = HEAD_CAMERA, colors: bool = True) -> CommandStreams:
