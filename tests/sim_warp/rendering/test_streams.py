@@ -7,6 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+import warp as wp
 from scipy.ndimage import binary_dilation
 from scipy.spatial.transform import Rotation
 
@@ -309,7 +310,11 @@ def test_threads_that_share_the_renderer_get_what_one_alone_gets():
 
 
 def test_threads_share_one_renderer_and_wait_until_it_is_made(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Warp hands out a GPU before its streams are there, so that a second renderer at that moment ends in an error."""
+    """Warp hands out a GPU before its streams are there, so that a second renderer at that moment ends in an error.
+
+    Warp would print a banner and a line for each module among what a command prints.
+    """
+    monkeypatch.setattr(wp.config, "log_level", wp.LOG_INFO)
     made: list[object] = []
 
     def make() -> object:
@@ -325,3 +330,4 @@ def test_threads_share_one_renderer_and_wait_until_it_is_made(monkeypatch: pytes
     finally:
         streams._make_default_renderer.cache_clear()
     assert len(made) == 1 and set(found) == set(made)
+    assert wp.config.log_level == wp.LOG_ERROR

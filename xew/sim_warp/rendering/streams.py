@@ -12,6 +12,7 @@ import numpy as np
 
 from xew.concurrency import PARSING
 from xew.protocol import ARMS
+from xew.sim_warp.devices.workers import quiet_warp
 from xew.sim_warp.embodiment.spec import RobotSpec
 from xew.sim_warp.geometry.camera import HEAD_CAMERA, Camera, look_at, project
 from xew.sim_warp.geometry.meshes import Color
@@ -66,13 +67,14 @@ class CommandStreams:
 
 
 def default_renderer() -> Renderer:
-    """The process's shared renderer on Warp's default device, created at first use."""
+    """The process's shared renderer on Warp's default device, created at first use, which silences Warp."""
     with PARSING:  # Warp's devices and `cache` are not thread-safe at first use
         return _make_default_renderer()
 
 
 @cache
 def _make_default_renderer() -> Renderer:
+    quiet_warp()
     return Renderer()
 
 
