@@ -270,7 +270,7 @@ def simulate(policy: Policy, open_predictor: Callable[[], Predictor], pending: S
             items = ordered[start : start + size]
             env = WorldModelEnv(predictor, [episode for episode, _ in items], size)
             for ((_, record), header), video in zip(items, run_policy(env, policy), strict=True):
-                writer.write(record, video, header)
+                writer.write(record, video, header | predictor.header)
 
 
 if __name__ == "__main__":

@@ -26,7 +26,7 @@ from xew.concurrency import map_in_order
 from xew.config import pick
 from xew.dataset import Episode
 from xew.episode import Record
-from xew.model.cache.clips import gives_render
+from xew.model.cache.clips import codec_digest, gives_render
 from xew.model.cache.scales import Scale, apply_scales
 from xew.model.codecs.contract import Codec, GivenFrames, encode_pictures, to_pictures, to_signed
 from xew.model.conditions import clip_numbers
@@ -38,6 +38,7 @@ from xew.model.sampling.reading import FIRST, RENDER, SCENE, EpisodeInputs, Epis
 from xew.model.settings.parts import ClipInputs
 from xew.model.settings.settings import RolloutSettings
 from xew.model.text.instructions import Instructions
+from xew.rollout import CODEC
 
 T = TypeVar("T")
 
@@ -169,6 +170,11 @@ class Predictor:
     def _sampling(self) -> ChunkSampling:
         settings = self.settings
         return ChunkSampling(settings.sampler, self.schedule, settings.guidance, self.inputs.latent_shape, settings.seed)
+
+    @property
+    def header(self) -> dict[str, str]:
+        """What rollouts say of the predictor: the digest of its codec, whose truth is the noise floor of their scores."""
+        return {CODEC: codec_digest(self.codec, self.inputs.clip, self.inputs.conditions)}
 
     @property
     def reader(self) -> EpisodeReader:
