@@ -82,7 +82,7 @@ Part = Kernels | Programs | CodecPrograms
 
 def missing_parts(settings: GradingSettings, jobs: Sequence[Job], codecs: Mapping[str, ModelCodec]) -> list[Part]:
     """What this machine's caches lack to grade some jobs, also through codecs, on its GPUs; nothing without a GPU."""
-    programs = [*list_programs(settings, jobs), *list_codec_programs(jobs, codecs)]
+    programs: list[Part] = [*list_programs(settings, jobs), *list_codec_programs(jobs, codecs)]
     missing = [part for part in programs if not _marker(part).exists()]
     return [*map(Kernels, _kernels().missing_kernels(list_kernels(settings))), *missing]
 

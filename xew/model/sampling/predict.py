@@ -9,7 +9,6 @@ the episode and the chunk. Batches are sharded over the mesh of the parameters.
 
 import functools
 import math
-import zlib
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field
@@ -24,7 +23,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from xew.concurrency import map_in_order
 from xew.config import pick
-from xew.dataset import Episode
+from xew.dataset import Episode, name_number
 from xew.episode import Record
 from xew.model.cache.clips import codec_digest, gives_render
 from xew.model.cache.scales import Scale, apply_scales
@@ -294,11 +293,6 @@ def predict_chunk(graph: nnx.GraphDef, params: Any, codec: Any, inputs: ChunkInp
     velocity, sampler = guided_velocity(model, inputs, sampling.guidance), pick(SAMPLERS, sampling.sampler, "sampler")
     frames = to_pictures(codec.decode_batch(sampler(velocity, reference, noise, sampling.schedule), inputs.given))
     return jax.lax.with_sharding_constraint(frames, PartitionSpec()) if jax.process_count() > 1 else frames
-
-
-def name_number(record: Record) -> int:
-    """Number of an episode by its task, seed and robot."""
-    return zlib.crc32(f"{record.task}/{record.seed}/{record.robot}".encode())
 
 
 def draw_noise(name: Array, chunk: Array | int, sampling: ChunkSampling) -> Array:
