@@ -305,7 +305,7 @@ def test_rollouts_cover_the_test_episodes(run: Path, world: Path) -> None:
         assert made.condition == "joints+robot_render"
     codec = open_roundtrip(run)  # whose truth is the floor of these rollouts' scores
     assert open_roundtrip(run / "config.yaml").digest == codec.digest, "the codec in the cache, before there is a run"
-    assert {made.model for made in found.values()} == {codec.model}
+    assert {(made.model, made.header["codec"]) for made in found.values()} == {(codec.model, codec.digest)}
     true = read_video(world / "data" / "/".join(next(iter(found.values())).folder.parts[-3:]) / "rgb.mkv")
     left = codec(true)
     error, inverse = (np.abs(left.astype(int) - video).mean() for video in (true, 255 - true))
@@ -324,6 +324,8 @@ def test_rollouts_resume_and_do_not_depend_on_the_batch(run: Path, world: Path, 
     piper, ur5 = (next(tmp_path.glob(f"*/*/{robot}/rgb.mkv")) for robot in ("piper", "ur5_wsg"))
     before, untouched = read_video(piper), ur5.stat().st_mtime_ns
     shutil.rmtree(piper.parent)
+    older = ur5.with_name("rollout.json")  # which did not name its codec
+    older.write_text(json.dumps({name: value for name, value in json.loads(older.read_text()).items() if name != "codec"}))
     rollout.main([str(run), "--out", str(tmp_path), "--robots", "piper", "ur5_wsg"])
     assert ur5.stat().st_mtime_ns == untouched
     again = read_video(piper)

@@ -7,6 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+import warp as wp
 from scipy.ndimage import binary_dilation
 from scipy.spatial.transform import Rotation
 
@@ -309,7 +310,11 @@ def test_threads_that_share_the_renderer_get_what_one_alone_gets():
 
 
 def test_threads_share_one_renderer_and_wait_until_it_is_made(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Warp hands out a GPU before its streams are there, so that a second renderer at that moment ends in an error."""
+    """Warp hands out a GPU before its streams are there, so that a second renderer at that moment ends in an error.
+
+    Warp would print a banner and a line for each module among what a command prints.
+    """
+    monkeypatch.setattr(wp.config, "log_level", wp.LOG_INFO)
     made: list[object] = []
 
     def make(frames_per_chunk: int | None) -> object:
@@ -322,3 +327,4 @@ def test_threads_share_one_renderer_and_wait_until_it_is_made(monkeypatch: pytes
     with ThreadPoolExecutor(4) as pool:
         found = list(pool.map(lambda _: default_renderer(96), range(4)))
     assert made == [96] and len(set(found)) == 1
+    assert wp.config.log_level == wp.LOG_ERROR

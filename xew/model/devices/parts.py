@@ -93,7 +93,7 @@ def _open_reader(read: Callable[[Item], Result]) -> Callable[[Item], Result]:
 
     quiet_warp()
     device = find_device(None)
-    keep_memory(device)
     default_renderer(FRAMES_OF_READER if device.is_cuda else None)
+    keep_memory(device)
     cv2.setNumThreads(1)  # processes share the cores
     return read

@@ -12,6 +12,7 @@ import numpy as np
 
 from xew.concurrency import PARSING
 from xew.protocol import ARMS
+from xew.sim_warp.devices.workers import quiet_warp
 from xew.sim_warp.embodiment.spec import RobotSpec
 from xew.sim_warp.geometry.camera import HEAD_CAMERA, Camera, look_at, project
 from xew.sim_warp.geometry.meshes import Color
@@ -66,9 +67,13 @@ class CommandStreams:
 
 
 def default_renderer(frames_per_chunk: int | None = None) -> Renderer:
-    """The process's shared renderer on Warp's default device; the first call creates it, with so many frames in flight."""
+    """The process's shared renderer on Warp's default device.
+
+    The first call silences Warp and creates the renderer, with so many frames in flight.
+    """
     with PARSING:  # Warp's devices are not thread-safe at first use
         if not _shared:
+            quiet_warp()
             _shared.append(Renderer(frames_per_chunk=frames_per_chunk))
         return _shared[0]
 
