@@ -26,6 +26,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "": set(),
     "statistics": set(),
     "video": set(),
+    "policies": set(),
     "sim_warp": set(),
     "model": {"sim_warp", "metrics"},
     "metrics": {"sim_warp"},
@@ -33,7 +34,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "analysis": {"sim_warp"},
 }
 """Rooms that a room may import; '' are the files at the root. All may import those and GROUND."""
-GROUND = {"", "statistics", "video"}
+GROUND = {"", "statistics", "video", "policies"}
 LAZILY = {
     ("model", "sim_warp"): ("conditions", "latents", "cache", "episodes", "devices.parts", "video"),
     ("model", "metrics"): ("codecs.ceiling", "conditions", "training.samples", "weights.reading"),
@@ -44,6 +45,7 @@ FORBIDDEN = {
     "": {"jax", "flax", "warp", "newton", "mujoco"},
     "statistics": {"jax", "flax", "warp", "newton", "mujoco"},
     "video": {"jax", "flax", "warp", "newton", "mujoco"},
+    "policies": {"jax", "flax", "warp", "newton", "mujoco"},
     "sim_warp": {"jax", "flax", "optax", "orbax", "grain"},
     "model": {"warp", "newton", "mujoco", "mujoco_warp", "torch", "diffusers", "transformers"},
     "metrics": {"warp", "newton", "mujoco", "flax"},

@@ -7,6 +7,7 @@ import contextlib
 import os
 import shutil
 import time
+import zlib
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
@@ -136,6 +137,11 @@ def find_records(data: Path) -> Iterator[Episode]:
 def find_accepted(data: Path) -> list[Episode]:
     """`Dataset.accepted` of a data set."""
     return list(read_dataset(data).accepted)
+
+
+def name_number(record: Record) -> int:
+    """Number of an episode by its task, seed and robot, for its random numbers."""
+    return zlib.crc32(f"{record.task}/{record.seed}/{record.robot}".encode())
 
 
 def holds_faults(data: Path) -> bool:

@@ -4,8 +4,8 @@ A rollout tree mirrors the data set, `<rollouts>/<task>/<seed>/<robot>/`. Each f
     one video       rgb.mkv as xew's own model writes it (lossless), one file of VIDEO_SUFFIXES (an .npz holds one array
                     [t h w 3] uint8), or PNG files, one a frame, numbered as 0.png or frame_000.png; RGB of 8 bits, native
                     size, constant rate, frame 0 the given frame
-    rollout.json    optional: model, condition, frame_count (requested frames), source_hash (of the episode's rgb), and any
-                    further keys
+    rollout.json    optional: model, condition, frame_count (requested frames), source_hash (of the episode's rgb), codec
+                    (digest of the model's codec, by which `evaluate` finds its noise floor), and any further keys
 Without rollout.json the model is named after the tree's folder, and the video must be as long as its episode.
 Trees may be of unknown origin: files outside a tree are not read, and a video that is incomplete or mislabeled is an error.
 """
@@ -34,6 +34,9 @@ VIDEO_SUFFIXES = (".mkv", ".mp4", ".mov", ".webm", ".avi", ".npz")
 """Endings of videos' names, in lower case; upper case is read, too."""
 HELD = ("rgb.mkv", "rollout.json")
 """Names of the files of a rollout that xew writes. A folder with any other file is never replaced."""
+
+CODEC = "codec"
+"""Key of rollout.json with the digest of the codec that a video was decoded with."""
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,7 @@
 """Latents, training, resuming and rollouts on synthetic data, end to end and tiny."""
 
 import ast
+import itertools
 import json
 import os
 import shutil
@@ -29,8 +30,10 @@ from xew.model.episodes.choice import training_episodes
 from xew.model.experiment import Experiment, load_experiment
 from xew.model.runs.log import RunLog
 from xew.model.runs.roundtrip import open_roundtrip
+from xew.model.training import order
 from xew.model.training.data import ClipSource, fake_batch
 from xew.model.training.order import make_dataset
+from xew.model.training.step import as_float32
 from xew.protocol import SEEN_ROBOTS, CameraSpec
 from xew.rollout import find_rollouts, read_rollout_video
 from xew.sim_warp.inspection.checks import tile_views
@@ -249,6 +252,21 @@ def test_batches_have_the_declared_shapes_and_resume(experiment: Experiment) -> 
     np.testing.assert_array_equal(next(continued).latents, second.latents)
 
 
+def test_batches_do_not_depend_on_the_number_of_threads_and_keep_the_type_on_disk(
+    experiment: Experiment, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    episodes = training_episodes(read_dataset(experiment.data), experiment.choice)
+    source = ClipSource.open(experiment.encoding, experiment.instructions, episodes)
+    read = []
+    for threads in (1, 8):
+        monkeypatch.setattr(order, "usable_cores", lambda threads=threads: threads)
+        read.append(list(itertools.islice(make_dataset(source, 2, seed=0), 4)))
+    for one, other in zip(*read, strict=True):
+        np.testing.assert_array_equal(one.latents, other.latents)
+        np.testing.assert_array_equal(one.text, other.text)
+    assert one.latents.dtype == np.float16 and as_float32(one).latents.dtype == np.float32
+
+
 def test_threads_parse_no_python(experiment: Experiment, monkeypatch: pytest.MonkeyPatch) -> None:
     """Two parsers at a time end in a SystemError now and then; loaders run beside all that the user does."""
     parsed: list[str] = []
@@ -287,7 +305,7 @@ def test_rollouts_cover_the_test_episodes(run: Path, world: Path) -> None:
         assert made.condition == "joints+robot_render"
     codec = open_roundtrip(run)  # whose truth is the floor of these rollouts' scores
     assert open_roundtrip(run / "config.yaml").digest == codec.digest, "the codec in the cache, before there is a run"
-    assert {made.model for made in found.values()} == {codec.model}
+    assert {(made.model, made.header["codec"]) for made in found.values()} == {(codec.model, codec.digest)}
     true = read_video(world / "data" / "/".join(next(iter(found.values())).folder.parts[-3:]) / "rgb.mkv")
     left = codec(true)
     error, inverse = (np.abs(left.astype(int) - video).mean() for video in (true, 255 - true))
@@ -306,6 +324,8 @@ def test_rollouts_resume_and_do_not_depend_on_the_batch(run: Path, world: Path, 
     piper, ur5 = (next(tmp_path.glob(f"*/*/{robot}/rgb.mkv")) for robot in ("piper", "ur5_wsg"))
     before, untouched = read_video(piper), ur5.stat().st_mtime_ns
     shutil.rmtree(piper.parent)
+    older = ur5.with_name("rollout.json")  # which did not name its codec
+    older.write_text(json.dumps({name: value for name, value in json.loads(older.read_text()).items() if name != "codec"}))
     rollout.main([str(run), "--out", str(tmp_path), "--robots", "piper", "ur5_wsg"])
     assert ur5.stat().st_mtime_ns == untouched
     again = read_video(piper)

@@ -6,6 +6,7 @@ import signal
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -124,11 +125,13 @@ def test_only_several_gpus_have_processes(
     ("backend", "cores", "memory", "episodes", "readers"),
     [
         ("cpu", 64, 0.0, 500, 0),
-        ("gpu", 16, 78.0, 500, 8),
-        ("gpu", 8, 78.0, 500, 4),
-        ("gpu", 16, 6.0, 500, 2),
-        ("gpu", 2, 78.0, 500, 0),
-        ("gpu", 16, 78.0, 31, 0),
+        ("gpu", 16, 84.0, 500, 8),
+        ("gpu", 64, 84.0, 500, 12),
+        ("gpu", 8, 84.0, 500, 4),
+        ("gpu", 16, 67.0, 500, 2),
+        ("gpu", 16, 40.0, 500, 0),
+        ("gpu", 2, 84.0, 500, 0),
+        ("gpu", 16, 84.0, 31, 0),
     ],
 )
 def test_processes_read_for_a_gpu_as_cores_memory_and_work_allow(
@@ -136,6 +139,7 @@ def test_processes_read_for_a_gpu_as_cores_memory_and_work_allow(
 ) -> None:
     monkeypatch.setattr(jax, "default_backend", lambda: backend)
     monkeypatch.setattr(parts, "free_gpu_memory", lambda _: (memory,))
+    monkeypatch.setattr(jax, "local_devices", lambda: [SimpleNamespace(memory_stats=lambda: {"bytes_limit": 64e9})])
     assert parts.choose_readers(episodes, min(rolling.MOST_READERS, cores // 2)) == readers
 
 

@@ -3,23 +3,30 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from gymnasium.error import ResetNeeded
 
 from tests import synthetic
 from tests.commands import run_command
 from tests.model.test_rollout import CONFIG, FRAMES, choose_tests, random_predictor
 from tests.test_docs import blocks, forget_modules, run_block
+from xew.config import ConfigError
 from xew.dataset import Episode, find_accepted
 from xew.episode import read_pixels, read_states, write_episode
 from xew.model import latents, rollout, simulate, train
 from xew.model.episodes.commands import new_command
 from xew.model.experiment import load_experiment
 from xew.model.sampling.predict import Predictor
-from xew.model.simulate import WorldModelEnv, expert, noisy_expert, run_policy
+from xew.model.simulate import WorldModelEnv
 from xew.model.video.frames import to_camera_size
+from xew.policies import environment
+from xew.policies.environment import run_policy
+from xew.policies.policy import expert, noisy_expert
 from xew.rollout import find_rollouts, read_rollout_video
+from xew.sim_warp.rendering.render import Renderer, World
 
 PAGE = Path(__file__).parents[2] / "docs" / "evaluate_a_policy.md"
 
@@ -60,11 +67,22 @@ def episodes(world: Path) -> Sequence[Episode]:
 @pytest.mark.parametrize(
     ("action", "embodiment"), [("joints", "robot_render"), ("mask_and_flow_channels", "carried_render_and_shadows")]
 )
-def test_the_experts_commands_give_the_rollout(action: str, embodiment: str, world: Path, episodes: Sequence[Episode]) -> None:
+def test_the_experts_commands_give_the_rollout(
+    action: str, embodiment: str, world: Path, episodes: Sequence[Episode], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """To the byte; grippers that never close carry nothing, so the carried scene is causal here."""
     predictor = predictor_of(world, "--model.action", action, "--model.embodiment", embodiment)
     open_loop = predictor.predict(episodes, FRAMES)
+    rendered: list[int] = []
+    render = Renderer.render_batch
+
+    def count(self: Renderer, worlds: Sequence[World], *args: Any, **options: Any) -> Any:
+        rendered.extend(len(world.pose) for world in worlds)
+        return render(self, worlds, *args, **options)
+
+    monkeypatch.setattr(Renderer, "render_batch", count)
     videos = run_policy(WorldModelEnv(predictor, episodes), expert)
+    assert max(rendered) == predictor.inputs.clip.frames, "new commands and the last one, whose flow they change"
     assert [len(video) for video in videos] == [record.frame_count for _, record in episodes] == [FRAMES - 2, FRAMES]
     for video, expected in zip(videos, open_loop, strict=True):
         np.testing.assert_array_equal(video, to_camera_size(expected[: len(video)]))
@@ -85,7 +103,7 @@ def test_it_is_an_environment(predictor: Predictor, episodes: Sequence[Episode])
         seen.append(frames[1])
     assert truncations == [[False, False], [False, False], [True, True]]
     np.testing.assert_array_equal(np.concatenate(seen)[: FRAMES - 1], env.videos()[1][1:])
-    with pytest.raises(simulate.ResetNeeded):
+    with pytest.raises(ResetNeeded):
         env.step(actions)
     _, info = env.reset(options={"episodes": episodes[::-1]})
     assert [record.robot for record in info["records"]] == ["piper", "arx_x5"] and info["frame"] == 0
@@ -110,13 +128,13 @@ def test_noise_depends_on_episode_and_frame_and_spares_grippers(predictor: Predi
 
 def test_commands_of_another_shape_are_refused(predictor: Predictor, episodes: Sequence[Episode]) -> None:
     env = WorldModelEnv(predictor, episodes)
-    with pytest.raises(simulate.ConfigError, match=r"gave commands \[2, 4, 7\]; expected \[2, 4, 16\]"):
+    with pytest.raises(ConfigError, match=r"gave commands \[2, 4, 7\]; expected \[2, 4, 16\]"):
         env.step(np.zeros((2, 4, 7)))
-    with pytest.raises(simulate.ConfigError, match="finite"):
+    with pytest.raises(ConfigError, match="finite"):
         env.step(np.full((2, 4, 16), np.nan))
-    with pytest.raises(simulate.ConfigError, match="found 1 episodes"):
+    with pytest.raises(ConfigError, match="found 1 episodes"):
         env.reset(options={"episodes": episodes[:1]})
-    with pytest.raises(simulate.ConfigError, match="expected at least one"):
+    with pytest.raises(ConfigError, match="expected at least one"):
         WorldModelEnv(predictor, [])
 
 
@@ -139,7 +157,7 @@ def test_the_command_writes_rollouts_that_are_graded(world: Path, tmp_path: Path
 def test_without_gymnasium_a_line_says_what_to_install(
     world: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(simulate, "VectorEnv", object)
+    monkeypatch.setattr(environment, "VectorEnv", object)
     with pytest.raises(SystemExit, match="2"):
         simulate.main([str(world / "runs" / "fixed"), "--data", str(world / "data")])
     assert "pip install 'xew[policy]'" in capsys.readouterr().err
@@ -150,7 +168,8 @@ def test_the_page_runs(world: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(world))
     commands = [line for _, text in blocks(PAGE) for line in text.splitlines() if line.startswith("python -m xew.model")]
     commands += [line.replace("expert", "my_policies:hold_still") for line in commands]
-    for language, text in [*(block for block in blocks(PAGE) if block[0] == "python"), ("bash", "\n".join(commands))]:
+    snippets = [block for block in blocks(PAGE) if block[0] == "python" and "SimulatorEnv" not in block[1]]
+    for language, text in [*snippets, ("bash", "\n".join(commands))]:
         run_block(language, text, world, monkeypatch)
     assert {path.name: len(find_rollouts(path)) for path in (world / "rollouts").iterdir() if path.is_dir()} == {
         "fixed-expert": 1,

@@ -79,6 +79,15 @@ class Command:
         return command_streams(self.robot_spec, self.action, self.camera, colors=False)
 
     @cached_property
+    def shadows(self) -> Video:
+        """The robot's shadows on the bare table under three standard lamps [t h w 3] uint8; imports Warp."""
+        from xew.sim_warp.rendering import streams
+
+        if self.parts:
+            return np.concatenate([part.shadows for part in self.parts], axis=1)
+        return streams.three_shadows(self.robot_spec, self.action, self.camera)
+
+    @cached_property
     def tools(self) -> Float[np.ndarray, "t 2 7"]:
         """Commanded poses [t 2 7] float64 of the left and right tool in the world: position [m], quaternion x y z w."""
         from xew.sim_warp.kinematics.forward import tool_poses
@@ -289,10 +298,7 @@ def ray_map(command: Command) -> Video:
 
 def three_shadows(command: Command) -> Video:
     """The robot's shadows on the bare table under three standard lamps, red, green and blue: [t h w 3] uint8."""
-    from xew.sim_warp.rendering import streams
-
-    parts = command.parts or (command,)
-    return np.concatenate([streams.three_shadows(part.robot_spec, part.action, part.camera) for part in parts], axis=1)
+    return command.shadows
 
 
 def reference_image(command: Command) -> Video:

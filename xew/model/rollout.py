@@ -31,6 +31,7 @@ from xew.model.sampling.predict import Predictor
 from xew.model.sampling.rolling import Item, roll_out
 from xew.model.settings.checks import check_experiment
 from xew.model.settings.settings import RolloutSettings
+from xew.rollout import CODEC
 
 
 def default_name(run: Path) -> str:
@@ -83,13 +84,15 @@ def predicted_frames(record: Record, max_frames: int) -> int:
 
 
 def is_done(out: Path, episode: Episode, header: dict[str, Any]) -> bool:
-    """Whether a rollout with this header exists already."""
+    """Whether a rollout with this header exists already. The codec is the checkpoint's, and older rollouts do not name it."""
     _, record = episode
     folder = episode_folder(out, record.task, record.seed, record.robot)
     try:
-        return read_json(folder / "rollout.json") == header and (folder / "rgb.mkv").exists()
-    except (OSError, ValueError):
+        stored = dict(read_json(folder / "rollout.json"))
+    except (OSError, ValueError, TypeError):
         return False
+    stored.pop(CODEC, None)
+    return stored == header and (folder / "rgb.mkv").exists()
 
 
 @dataclass(frozen=True)

@@ -110,8 +110,8 @@ def train(experiment: Experiment, *, resume: bool = False, overwrite: bool = Fal
     spec = experiment.spec.with_steps(source.fresh)
     settings = spec.settings
     codec = source.cache.codec
-    batches = iter(make_dataset(source, settings.batch, settings.seed, spec.mixed, own))
     trainer = make_trainer(spec, mesh, codec)
+    batches = iter(make_dataset(source, settings.batch, settings.seed, spec.mixed, own, trainer.place))
     check_memory(estimate_memory(trainer, experiment.encoding), ignore=ignore_memory)
 
     trained = (*episodes.fresh, *episodes.mixed)
@@ -129,7 +129,7 @@ def train(experiment: Experiment, *, resume: bool = False, overwrite: bool = Fal
             samples.log(session.log, trainer.average_params(state), step)
 
         meter = Meter(summarize, settings.batch, flops_of_step(spec))
-        state = run_steps(timetable, session, meter, trainer.step, state, batches, draw_samples, trainer.place)
+        state = run_steps(timetable, session, meter, trainer.step, state, batches, draw_samples)
     return int(state.step) >= settings.steps
 
 

@@ -129,7 +129,7 @@ def test_references_are_what_they_are_called(data: Path) -> None:
     episodes = find_accepted(data)
     folder, record = episodes[0]
     truth = read_truth(folder, record.frame_count, NEEDS)
-    videos = dict(reference_videos(episodes, episodes[0], truth, ModelCodec(Inverse(), "inverse")))
+    videos = dict(reference_videos(episodes, episodes[0], truth, ModelCodec(Inverse(), "inverse", Path("run"))))
     assert set(APPEARANCES) <= set(videos) and {len(video) for video in videos.values()} == {len(truth.rgb)}
     np.testing.assert_array_equal(videos["truth through the codec"], 255 - truth.rgb)
     np.testing.assert_array_equal(videos["frozen first frame"], np.repeat(truth.rgb[:1], len(truth.rgb), axis=0))

@@ -84,7 +84,7 @@ class Halved:
     """A codec for tests, which leaves every second pixel; the folder of its run has the name of the model."""
 
     def __init__(self, run: Path) -> None:
-        self.model, self.digest = run.name, "halved"
+        self.model, self.digest = run.name.partition("-")[0], run.name.partition("-")[2] or "halved"
 
     def __call__(self, video: np.ndarray, episode: Path | None = None) -> np.ndarray:
         return video[:, ::2, ::2].repeat(2, axis=1).repeat(2, axis=2)
@@ -120,7 +120,52 @@ def test_the_floor_of_a_model_is_the_truth_through_its_codec(
         assert pairs.loc[robot, "noise"] == means.loc[(robot, "late", "mask_iou"), "noise"]
     with pytest.raises(SystemExit):
         grade(rollouts, data, codec=(Path("runs/early"),), **codec)
-    assert "of 'early', of which no rollout is graded; graded are late" in capsys.readouterr().err
+    assert "of 'early', and no graded rollout was made with its codec; graded are late" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("runs", "digests", "floors"),
+    [
+        (("late",), (None, "halved"), {"late", "later"}),
+        (("late",), ("halved", "halved"), {"late", "later"}),
+        (("late", "later"), (None, None), {"late", "later"}),
+        (("other", "late"), ("halved", "halved"), {"late", "later"}),
+        (("late",), (None, "third"), {"late"}),
+        (("other-third",), ("halved", "third"), {"later"}),
+        (("late", "later-third"), ("halved", "third"), {"late", "later"}),
+    ],
+)
+def test_models_with_one_codec_have_its_floor(
+    runs: tuple[str, ...],
+    digests: tuple[str | None, str | None],
+    floors: set[str],
+    data: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """By the digest that rollouts say, or else by the name of the run; the truth goes once through each codec."""
+    monkeypatch.setattr(codecs, "OPENER", f"{__name__}:Halved")
+    for model, digest in zip(("late", "later"), digests, strict=True):
+        header = {"model": model} | ({"codec": digest} if digest else {})
+        write_rollout(tmp_path / model, TASK, SEED, ROBOTS[0], late(truth(data, ROBOTS[0])), header)
+    out, named = tmp_path / "scores.parquet", tuple(map(Path, runs))
+    main(Args((tmp_path / "late", tmp_path / "later"), data, out, metrics=("psnr",), baselines=False, codec=named))
+    scores = pd.read_parquet(out)
+    through = scores[scores["model"] == CODEC_TRUTH]["condition"]
+    assert set(scores.attrs["codecs"]) == floors and through.is_unique
+    assert set(through) == {key for keys in scores.attrs["codecs"].values() for key in keys}
+
+
+def test_a_model_has_one_codec(
+    rollouts: Path, data: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(codecs, "OPENER", f"{__name__}:Halved")
+    for robot, digest in zip(ROBOTS, ("halved", "third"), strict=True):
+        header = {"model": "late", "codec": digest}
+        write_rollout(rollouts, TASK, SEED, robot, late(truth(data, robot)), header)
+    with pytest.raises(SystemExit):
+        grade(rollouts, data, codec=(Path("late"), Path("other-third")))
+    assert "rollouts of 'late' were made with two codecs of --codec" in capsys.readouterr().err
 
 
 def test_baselines_are_graded_before_there_is_a_model(

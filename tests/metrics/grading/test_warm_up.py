@@ -16,9 +16,11 @@ from xew.metrics.episode_cache import EpisodeCache
 from xew.metrics.estimators.batched import compiling
 from xew.metrics.grade import Comparison, grade
 from xew.metrics.grading import list_jobs, open_graders, warm_up
+from xew.metrics.grading.codecs import ModelCodec
 from xew.metrics.grading.settings import Args, GradingSettings, resolve
-from xew.metrics.grading.warm_up import Kernels, Programs
+from xew.metrics.grading.warm_up import CodecPrograms, Kernels, Programs
 from xew.metrics.truth import Truth
+from xew.protocol import CODEC_TRUTH
 
 COMPILED = "/jax/core/compile/backend_compile_duration"
 
@@ -55,7 +57,7 @@ def test_programs_are_those_of_all_videos_that_are_filled_up_alike(monkeypatch: 
 
 
 def test_parts_cover_the_metrics_of_frames_and_the_estimators(resolved: GradingSettings, jobs: list[list_jobs.Job]) -> None:
-    parts = warm_up.missing_parts(resolved, jobs)
+    parts = warm_up.missing_parts(resolved, jobs, {})
     programs = [part for part in parts if isinstance(part, Programs)]
     assert sorted(name for part in programs for name in part.metrics) == sorted(
         name for name in resolved.metrics if METRICS[name].inputs != "track"
@@ -88,7 +90,7 @@ def test_parts_are_compiled_once(
         return parts
 
     monkeypatch.setattr(open_graders, "map_in_processes", compile_here)
-    start = functools.partial(open_graders.warm_up, resolved, gpus=("0",))
+    start = functools.partial(open_graders.warm_up, resolved, codecs=CODECS, gpus=("0",))
     start(jobs)
     assert len(done) == 10 and "compiled once on this machine, in 10 parts" in capsys.readouterr().out
     monkeypatch.setattr(compiling, "missing_kernels", lambda modules: [])
@@ -96,6 +98,42 @@ def test_parts_are_compiled_once(
     assert len(done) == 10 and capsys.readouterr().out == ""
     start([replace(job, cell=replace(job.cell, frames=100)) for job in jobs])
     assert len(done) == 13, "longer videos need other programs"
+    start([*jobs, *through_codecs(jobs)])
+    assert done[13:] == [CodecPrograms("new", 25, Path("run")), CodecPrograms("old", 49, Path("run"))]
+    start(through_codecs(jobs))
+    assert len(done) == 15
+
+
+class Coded:
+    """A codec for tests, whose programs are for 24 frames and, without pieces, their multiples."""
+
+    model = "coded"
+
+    def __init__(self, digest: str) -> None:
+        self.digest = digest
+
+    def coded_length(self, frames: int) -> int:
+        return 25 if self.digest == "new" else (frames + 22) // 24 * 24 + 1
+
+    def compile(self, frames: int) -> None:
+        pytest.fail("compiled by another process")
+
+    def __call__(self, video: np.ndarray, episode: Path) -> np.ndarray:
+        return video
+
+
+CODECS = {name: ModelCodec(Coded(name), name, Path("run")) for name in ("new", "old")}
+
+
+def through_codecs(jobs: list[list_jobs.Job]) -> list[list_jobs.Job]:
+    """The truth of jobs through two codecs, at lengths that share a program."""
+    cells = [
+        (job, replace(job.cell, model=CODEC_TRUTH, condition=codec.key, frames=frames))
+        for job in jobs
+        for codec in CODECS.values()
+        for frames in (40, 49)
+    ]
+    return [replace(job, cell=cell) for job, cell in cells]
 
 
 def test_no_gpu_compiles_nothing(resolved: GradingSettings, jobs: list[list_jobs.Job], monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,6 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+import warp as wp
 from scipy.ndimage import binary_dilation
 from scipy.spatial.transform import Rotation
 
@@ -309,19 +310,21 @@ def test_threads_that_share_the_renderer_get_what_one_alone_gets():
 
 
 def test_threads_share_one_renderer_and_wait_until_it_is_made(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Warp hands out a GPU before its streams are there, so that a second renderer at that moment ends in an error."""
+    """Warp hands out a GPU before its streams are there, so that a second renderer at that moment ends in an error.
+
+    Warp would print a banner and a line for each module among what a command prints.
+    """
+    monkeypatch.setattr(wp.config, "log_level", wp.LOG_INFO)
     made: list[object] = []
 
-    def make() -> object:
+    def make(frames_per_chunk: int | None) -> object:
         time.sleep(0.02)
-        made.append(object())
-        return made[-1]
+        made.append(frames_per_chunk)
+        return object()
 
     monkeypatch.setattr(streams, "Renderer", make)
-    streams._make_default_renderer.cache_clear()
-    try:
-        with ThreadPoolExecutor(4) as pool:
-            found = list(pool.map(lambda _: default_renderer(), range(4)))
-    finally:
-        streams._make_default_renderer.cache_clear()
-    assert len(made) == 1 and set(found) == set(made)
+    monkeypatch.setattr(streams, "_shared", [])
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(lambda _: default_renderer(96), range(4)))
+    assert made == [96] and len(set(found)) == 1
+    assert wp.config.log_level == wp.LOG_ERROR

@@ -12,7 +12,7 @@ from xew.dataset import Episode, demand_one_change, demand_one_motion, find_acce
 from xew.episode import EpisodeError, Record, episode_folder, read_record
 from xew.files import digest_files
 from xew.metrics.grading.baselines import BASELINES
-from xew.metrics.grading.codecs import ModelCodec, open_codecs
+from xew.metrics.grading.codecs import ModelCodec, match_codecs, open_codecs
 from xew.metrics.grading.scores import Cell
 from xew.metrics.grading.settings import GradingSettings
 from xew.protocol import BASELINES as TITLES
@@ -46,6 +46,7 @@ class Listing:
     jobs: Sequence[Job]
     """Each video once, those of one episode together."""
     codecs: Mapping[str, ModelCodec]
+    """The codecs of graded models, or, without rollouts, of runs; by the model's name."""
     motion: str
     errors: Sequence[str]
     """Messages about rollouts that cannot be graded and are left out."""
@@ -76,10 +77,11 @@ def list_jobs(settings: GradingSettings, baselines: Collection[str] | None = Non
     errors: list[str] = []
     problems = errors if args.keep_going else None
     rollouts = None if args.baselines_of else _find_unique(args.rollouts, problems)
-    codecs = open_codecs(args.codec, None if rollouts is None else {rollout.model for rollout in rollouts})
+    codecs = open_codecs(args.codec)
     if rollouts is None:
         jobs = _list_baseline_jobs(settings, baselines, codecs)
     else:
+        codecs = match_codecs(codecs, rollouts)
         jobs = _list_rollout_jobs(rollouts, settings, baselines, codecs, problems)
     records = {job.episode: job.record for job in jobs}.values()
     return Listing(jobs, codecs, demand_one_motion(args.data, records), errors, demand_one_change(args.data, records))
@@ -164,7 +166,7 @@ def _list_baseline_jobs(settings: GradingSettings, baselines: Collection[str], c
         rgb, states = (record.hashes.get(name, "") for name in ("rgb", "states"))
         frames = min(record.frame_count, args.max_frames or record.frame_count)
         cell = Cell("", "", record.task, record.seed, record.robot, frames, "", rgb, states, str(settings.choices))
-        jobs += _baseline_jobs(cell, (folder, record), settings, baselines, codecs.values())
+        jobs += _baseline_jobs(cell, (folder, record), settings, baselines, dict.fromkeys(codecs.values()))
     return sorted(jobs, key=lambda job: (job.episode, job.cell.key))
 
 

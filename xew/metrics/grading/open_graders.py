@@ -85,7 +85,7 @@ def grade_groups(
     """
     processes, gpus = choose_processes(len(groups), sum(map(len, groups))), visible_gpus()
     if gpus and groups:
-        warm_up(settings, [job for group in groups for job, _ in group], gpus)
+        warm_up(settings, [job for group in groups for job, _ in group], codecs, gpus)
     if processes > 1:
         _start_imports()
         with queue_to(lambda _: done()) as queue:
@@ -97,9 +97,9 @@ def grade_groups(
     yield from map_in_order(open_grader(settings, codecs, stop, done), groups, threads, stop)
 
 
-def warm_up(settings: GradingSettings, jobs: Sequence[Job], gpus: Sequence[str]) -> None:
+def warm_up(settings: GradingSettings, jobs: Sequence[Job], codecs: Mapping[str, ModelCodec], gpus: Sequence[str]) -> None:
     """Compile what the machine's caches lack to grade these jobs, before any process grades."""
-    parts = missing_parts(settings, jobs)
+    parts = missing_parts(settings, jobs, codecs)
     if not parts:
         return
     print(f"kernels and programs for the GPU are compiled once on this machine, in {len(parts)} parts", flush=True)
@@ -107,7 +107,7 @@ def warm_up(settings: GradingSettings, jobs: Sequence[Job], gpus: Sequence[str])
     compiled = map_in_processes(opener, parts, min(len(parts), usable_cores()), IMPORTED, gpus)
     for _ in tqdm(compiled, desc="compile", unit="part", total=len(parts), disable=None, leave=False):
         pass
-    note_compiled(settings, jobs)
+    note_compiled(parts)
 
 
 def _open_compiler(trust: Sequence[str]) -> Callable[[Part], None]:

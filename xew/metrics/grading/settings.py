@@ -58,8 +58,8 @@ class Args:
     max_frames: int = 0
     """With --baselines-of: grade this number of frames; 0 for whole episodes."""
     codec: tuple[Path, ...] = ()
-    """Runs of `xew.model.train` that made some of the rollouts: the truth is graded through the codec of each, and is the noise
-    floor of its model's scores. Other models have the floor of the true video. With --baselines-of a config of
+    """Runs of `xew.model.train` that made some of the rollouts: the truth is graded through each of their codecs, and is the
+    noise floor of all models with that codec. Other models have the floor of the true video. With --baselines-of a config of
     `xew.model.train` may be named instead of a run."""
     resample: Literal["scene", "task"] = "scene"
     """Unit that the summary's intervals resample: scenes within tasks, or whole tasks."""

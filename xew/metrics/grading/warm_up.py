@@ -4,8 +4,8 @@ Otherwise every process that grades would compile all of them, one after another
 """
 
 import hashlib
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
 
@@ -17,10 +17,12 @@ from xew.files import cache_folder, write_text
 from xew.metrics import METRICS, perceptual
 from xew.metrics.episode_cache import EpisodeCache, is_on_cpu
 from xew.metrics.grade import JUDGED, ON_SURFACES, Comparison, grade, input_kind
+from xew.metrics.grading.codecs import ModelCodec, open_codec
 from xew.metrics.grading.list_jobs import Job
 from xew.metrics.grading.settings import GradingSettings
 from xew.metrics.metric import ACCELERATOR_CHUNK
 from xew.metrics.truth import Truth
+from xew.protocol import CODEC_TRUTH
 
 DEFAULT = "default"
 """Name of the estimators that run in Warp's kernels."""
@@ -59,20 +61,39 @@ class Programs:
         grade(Comparison(prediction, EpisodeCache(truth, 0), lambda *_: mask, lambda *_: points), self.metrics)
 
 
-Part = Kernels | Programs
+@dataclass(frozen=True)
+class CodecPrograms:
+    """JAX's programs of a codec, for videos of one length."""
+
+    digest: str
+    length: int
+    """Number of frames that are coded."""
+    run: Path = field(compare=False, repr=False)
+    """Folder of a run with this codec."""
+
+    def compile(self) -> None:
+        """Take a video through the codec, if JAX has a GPU."""
+        if not is_on_cpu():
+            open_codec(self.run).compile(self.length)
 
 
-def missing_parts(settings: GradingSettings, jobs: Sequence[Job]) -> list[Part]:
-    """What this machine's caches lack to grade some jobs on its GPUs; nothing without a GPU."""
-    programs = () if _marker(settings, jobs).exists() else list_programs(settings, jobs)
-    return [*map(Kernels, _kernels().missing_kernels(list_kernels(settings))), *programs]
+Part = Kernels | Programs | CodecPrograms
 
 
-def note_compiled(settings: GradingSettings, jobs: Sequence[Job]) -> None:
-    """Note that JAX's cache holds the programs of some jobs."""
-    path = _marker(settings, jobs)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_text(path, _describe(settings, jobs), within=path.parent)
+def missing_parts(settings: GradingSettings, jobs: Sequence[Job], codecs: Mapping[str, ModelCodec]) -> list[Part]:
+    """What this machine's caches lack to grade some jobs, also through codecs, on its GPUs; nothing without a GPU."""
+    programs: list[Part] = [*list_programs(settings, jobs), *list_codec_programs(jobs, codecs)]
+    missing = [part for part in programs if not _marker(part).exists()]
+    return [*map(Kernels, _kernels().missing_kernels(list_kernels(settings))), *missing]
+
+
+def note_compiled(parts: Sequence[Part]) -> None:
+    """Note which of these programs JAX's cache holds; Warp's cache tells by itself."""
+    for part in parts:
+        if not isinstance(part, Kernels):
+            path = _marker(part)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_text(path, _describe(part), within=path.parent)
 
 
 def list_kernels(settings: GradingSettings) -> list[str]:
@@ -95,6 +116,14 @@ def list_programs(settings: GradingSettings, jobs: Sequence[Job]) -> list[Progra
     return [Programs(tuple(names), _find_shapes(settings, jobs)) for names in parts.values()]
 
 
+def list_codec_programs(jobs: Sequence[Job], codecs: Mapping[str, ModelCodec]) -> list[CodecPrograms]:
+    """Programs of the codecs that the truth goes through: a part for each codec and length of coded videos."""
+    by_key = {codec.key: codec for codec in codecs.values()}
+    through = {(by_key[job.cell.condition], job.cell.frames) for job in jobs if job.cell.model == CODEC_TRUTH}
+    parts = {CodecPrograms(codec.digest, codec.roundtrip.coded_length(frames), codec.run) for codec, frames in through}
+    return sorted(parts, key=lambda part: (part.digest, part.length))
+
+
 def _find_shapes(settings: GradingSettings, jobs: Sequence[Job]) -> tuple[tuple[int, int, int], ...]:
     """Shapes of the jobs' graded videos, filled up as programs take them."""
     sizes = {(job.cell.frames - settings.first_frame, job.record.camera.size) for job in jobs}
@@ -102,15 +131,15 @@ def _find_shapes(settings: GradingSettings, jobs: Sequence[Job]) -> tuple[tuple[
     return tuple(sorted({(-(-frames // block) * block, height, width) for frames, (width, height) in sizes}))
 
 
-def _marker(settings: GradingSettings, jobs: Sequence[Job]) -> Path:
-    return cache_folder("evaluate") / hashlib.sha256(_describe(settings, jobs).encode()).hexdigest()[:16]
+def _marker(part: Part) -> Path:
+    return cache_folder("evaluate") / hashlib.sha256(_describe(part).encode()).hexdigest()[:16]
 
 
-def _describe(settings: GradingSettings, jobs: Sequence[Job]) -> str:
+def _describe(part: Part) -> str:
     """What compiled programs depend on, as text."""
     versions = xew.__version__, jax.__version__, *_kernels().gpu_names()
     cache = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
-    return "\n".join(map(str, (*versions, cache, settings.metrics, _find_shapes(settings, jobs)))) + "\n"
+    return "\n".join(map(str, (*versions, cache, part))) + "\n"
 
 
 def _kernels() -> ModuleType:

@@ -8,7 +8,7 @@ import numpy as np
 
 from xew.episode import Record
 from xew.model.codecs.contract import Codec
-from xew.model.conditions import SHOW_RENDER, Command, Condition, clip_numbers
+from xew.model.conditions import SHOW_RENDER, Command, Condition, clip_numbers, shows_carried
 from xew.model.episodes.commands import episode_command
 from xew.model.settings.settings import Clip
 from xew.model.video.frames import to_model_size
@@ -67,6 +67,12 @@ def needed_pixels(conditions: Mapping[str, Condition], streams: Collection[str])
 def gives_render(codec: Codec, conditions: Mapping[str, Condition]) -> bool:
     """Whether a model's decoder is given the commanded robot's render: it uses it, and a condition holds it."""
     return codec.sees_render and any(condition.make in SHOW_RENDER for condition in conditions.values())
+
+
+def codec_digest(codec: Codec, clip: Clip, conditions: Mapping[str, Condition]) -> str:
+    """Identifier of what the codec of a model with these clips and conditions leaves of a true video."""
+    carried = " carried" if gives_render(codec, conditions) and shows_carried(conditions.values()) else ""
+    return f"{codec.decoder_hash} {clip.height}x{clip.width}{carried}"
 
 
 def cut_clip(

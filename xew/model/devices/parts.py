@@ -19,8 +19,10 @@ from xew.concurrency import free_gpu_memory, map_in_order, map_in_processes, map
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-GPU_MEMORY_OF_READER = 2.5
-"""GPU memory of a process that reads [GB]: 512 frames in flight and CUDA's own memory."""
+FRAMES_OF_READER = 96
+"""Number of frames in flight of a process that reads and renders on a GPU; each takes 7 MB."""
+GPU_MEMORY_OF_READER = 1.5
+"""GPU memory of a process that reads [GB]: frames in flight, CUDA's own memory of 0.5 GB, and a margin."""
 EPISODES_OF_READER = 4
 """Number of episodes for which a process that reads is worth its start of a few seconds."""
 RENDERERS = ("xew.sim_warp.rendering.streams",)
@@ -62,9 +64,14 @@ def choose_readers(episodes: int, most: int) -> int:
     """Number of processes, at most `most`, that read for the GPU of this process; 0 for threads, as on a CPU."""
     if jax.default_backend() != "gpu" or not hasattr(os, "memfd_create"):
         return 0
-    memory = min(free_gpu_memory(visible_gpus()), default=0.0)
-    count = min(most, int(memory / GPU_MEMORY_OF_READER))
+    count = min(most, int(spare_gpu_memory() / GPU_MEMORY_OF_READER))
     return count if count > 1 and episodes >= count * EPISODES_OF_READER else 0
+
+
+def spare_gpu_memory() -> float:
+    """Memory of this process's GPU that stays free when JAX has grown to its limit, by default 75 % of the GPU [GB]."""
+    limit = (jax.local_devices()[0].memory_stats() or {}).get("bytes_limit", 0)
+    return max(0.0, min(free_gpu_memory(visible_gpus()), default=0.0) - limit / 1e9)
 
 
 def read_ahead(
@@ -82,8 +89,11 @@ def read_ahead(
 
 def _open_reader(read: Callable[[Item], Result]) -> Callable[[Item], Result]:
     from xew.sim_warp.devices.workers import find_device, keep_memory, quiet_warp
+    from xew.sim_warp.rendering.streams import default_renderer
 
     quiet_warp()
-    keep_memory(find_device(None))
+    device = find_device(None)
+    default_renderer(FRAMES_OF_READER if device.is_cuda else None)
+    keep_memory(device)
     cv2.setNumThreads(1)  # processes share the cores
     return read

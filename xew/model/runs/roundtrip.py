@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from xew.episode import read_record
-from xew.model.cache.clips import gives_render
+from xew.model.cache.clips import codec_digest, gives_render
 from xew.model.cache.store import load_codec
 from xew.model.codecs.contract import Codec, given_frames
 from xew.model.conditions import shown_scene, shows_carried
@@ -33,14 +33,24 @@ class RunRoundtrip:
 
     @property
     def digest(self) -> str:
-        """Identifier of the codec and its picture size."""
-        carried = " carried" if self.sees_render and shows_carried(self.experiment.conditions.values()) else ""
-        return f"{self.codec.decoder_hash} {self.experiment.clip.height}x{self.experiment.clip.width}{carried}"
+        """Identifier of the codec, its picture size and what its decoder is given, as in the headers of rollouts."""
+        return codec_digest(self.codec, self.experiment.clip, self.experiment.conditions)
 
     @property
     def sees_render(self) -> bool:
         """Whether the model's decoder is given the commanded robot's render."""
         return gives_render(self.codec, self.experiment.conditions)
+
+    def coded_length(self, frames: int) -> int:
+        """Number of frames of the shortest video with the compiled programs of a video of `frames` frames, at least 2."""
+        return 1 + LENGTH_BLOCK * (1 if self.codec.groups_independent else -(-(frames - 1) // LENGTH_BLOCK))
+
+    def compile(self, frames: int) -> None:
+        """Compile the programs for videos of a `coded_length`, with black pictures."""
+        clip, conditions = self.experiment.clip, self.experiment.conditions.values()
+        black = np.zeros((frames, clip.height, clip.width, 3), np.uint8)
+        given = (black, black if shows_carried(conditions) else black[:1]) if self.sees_render else None
+        self._code(black, given, 0, frames - 1)
 
     def __call__(self, video: np.ndarray, episode: Path | None = None) -> np.ndarray:
         """Reconstruct a video [t h w 3] uint8 of any length: [t h w 3] uint8.

@@ -9,7 +9,6 @@ the episode and the chunk. Batches are sharded over the mesh of the parameters.
 
 import functools
 import math
-import zlib
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field
@@ -24,9 +23,9 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from xew.concurrency import map_in_order
 from xew.config import pick
-from xew.dataset import Episode
+from xew.dataset import Episode, name_number
 from xew.episode import Record
-from xew.model.cache.clips import gives_render
+from xew.model.cache.clips import codec_digest, gives_render
 from xew.model.cache.scales import Scale, apply_scales
 from xew.model.codecs.contract import Codec, GivenFrames, encode_pictures, to_pictures, to_signed
 from xew.model.conditions import clip_numbers
@@ -38,6 +37,7 @@ from xew.model.sampling.reading import FIRST, RENDER, SCENE, EpisodeInputs, Epis
 from xew.model.settings.parts import ClipInputs
 from xew.model.settings.settings import RolloutSettings
 from xew.model.text.instructions import Instructions
+from xew.rollout import CODEC
 
 T = TypeVar("T")
 
@@ -171,6 +171,11 @@ class Predictor:
         return ChunkSampling(settings.sampler, self.schedule, settings.guidance, self.inputs.latent_shape, settings.seed)
 
     @property
+    def header(self) -> dict[str, str]:
+        """What rollouts say of the predictor: the digest of its codec, whose truth is the noise floor of their scores."""
+        return {CODEC: codec_digest(self.codec, self.inputs.clip, self.inputs.conditions)}
+
+    @property
     def reader(self) -> EpisodeReader:
         """Reader of the inputs of `begin` and `start`."""
         conditions = self.inputs.conditions
@@ -288,11 +293,6 @@ def predict_chunk(graph: nnx.GraphDef, params: Any, codec: Any, inputs: ChunkInp
     velocity, sampler = guided_velocity(model, inputs, sampling.guidance), pick(SAMPLERS, sampling.sampler, "sampler")
     frames = to_pictures(codec.decode_batch(sampler(velocity, reference, noise, sampling.schedule), inputs.given))
     return jax.lax.with_sharding_constraint(frames, PartitionSpec()) if jax.process_count() > 1 else frames
-
-
-def name_number(record: Record) -> int:
-    """Number of an episode by its task, seed and robot."""
-    return zlib.crc32(f"{record.task}/{record.seed}/{record.robot}".encode())
 
 
 def draw_noise(name: Array, chunk: Array | int, sampling: ChunkSampling) -> Array:

@@ -87,7 +87,7 @@ def predict_and_write(
     def write_oldest() -> None:
         items, prediction = started.popleft()
         for ((_, record), header), video in zip(items, prediction.fetch(), strict=True):
-            writer.write(record, video[: header["frame_count"]], header)
+            writer.write(record, video[: header["frame_count"]], header | predictor.header)
 
     with writer:
         for start in range(0, len(ordered), size):

@@ -24,9 +24,9 @@ class Batch:
     """Arrays of a training batch."""
 
     latents: Any
-    """[b t h w c] float32, the RGB stream."""
+    """[b t h w c] float16 as stored, the RGB stream; a training step computes with float32."""
     conditions: dict[str, Any]
-    """Arrays by stream or mechanism: [b t' h' w' c] latents or [b t' n] numbers, scaled, float32."""
+    """Arrays by stream or mechanism: [b t' h' w' c] float16 latents or [b t' n] float32 numbers, scaled."""
     text: Any
     """[b l e] float32, or [b l] int32 rows of the network's table of words; zero-padded."""
     valid: Any = None
@@ -87,7 +87,7 @@ class ClipSource:
     def _read_chunk(self, record: Record, start: int) -> Batch:
         inputs = self.cache.encoding.inputs
         clip = self.cache.starts(record).index(start)
-        arrays = {name: self.cache.read(record, name, clip).astype(np.float32) for name in self.cache.streams}
+        arrays = {name: self.cache.read(record, name, clip) for name in self.cache.streams}
         valid = valid_frames(record.frame_count - start, inputs.clip.frames)
         latents = arrays.pop("rgb")
         conditions = apply_scales(self.scales, inputs.conditions, arrays)

@@ -120,7 +120,6 @@ def run_steps(
     state: TrainState,
     batches: Any,
     draw_samples: Callable[[TrainState, int], None],
-    place: Callable[[Any], Any] = lambda batch: batch,
 ) -> TrainState:
     """Train from the given state to the last step; after a signal, the current state is saved and returned.
 
@@ -130,16 +129,15 @@ def run_steps(
         meter: of results and times.
         take_step: (state, batch) -> (next state, result).
         state: to start from.
-        batches: an iterator of this process's batches, with its position (get_state).
+        batches: an iterator of batches on the devices, with its position (get_state).
         draw_samples: called with the state and its step.
-        place: function that moves a batch to the devices; its time counts as waiting for data.
     """
     begin, stop, log = int(state.step), StopSignal(), session.log
     total = timetable.steps if timetable.is_over is None else None
     progress = tqdm(iter(range(begin, timetable.steps)), desc="train", initial=begin, total=total, file=sys.stderr)
     for step in (number + 1 for number in progress):
         requested = time.perf_counter()
-        batch = place(next(batches))
+        batch = next(batches)
         wait_s = time.perf_counter() - requested
         state, result = take_step(state, batch)
         meter.add(result, wait_s)

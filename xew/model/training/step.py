@@ -127,6 +127,7 @@ class Trainer:
     def _step(self, state: TrainState, batch: Batch, codec: Codec | None) -> tuple[TrainState, StepResult]:
         settings = self.spec.settings
         key = jax.random.fold_in(jax.random.key(settings.seed), state.step)
+        batch = as_float32(batch)
         samples = Samples(batch, chunk_weights(batch), jax.random.split(key, len(batch.latents)))
         params, vjp_fn = jax.vjp(
             lambda learned: self._keep_sharded(cast_params(self.graph, apply_lora(state.base, learned))), state.params
@@ -240,6 +241,11 @@ def estimate_clean(latents: Array, pair: TrainingPair, predicted: Array) -> Arra
     """Estimate the clean latents [b t h w c] in one step from a predicted velocity [b t h w c]; frame 0 is the given one."""
     clean = pair.noisy - pair.sigma[:, None, None, None, None] * predicted
     return put_first(clean, latents[:, :1])
+
+
+def as_float32(batch: Batch) -> Batch:
+    """The batch with its latents, stored as float16, as float32."""
+    return jax.tree.map(lambda leaf: leaf.astype(jnp.float32) if leaf.dtype == jnp.float16 else leaf, batch)
 
 
 def chunk_weights(batch: Batch) -> Array:

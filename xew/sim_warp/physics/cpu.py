@@ -26,25 +26,47 @@ mujoco.set_mju_user_warning(lambda message: None)
 _ARMS = ((LEFT_FINGERS, LEFT_ARM_LINKS), (RIGHT_FINGERS, RIGHT_ARM_LINKS))
 
 
+class Stepper:
+    """A world in the engine, stepped through commands as they come; it starts at the first command of `world`."""
+
+    def __init__(self, world: World) -> None:
+        convert_quickly()
+        solver = build_solver([world], "cpu", use_mujoco_cpu=True)
+        self.world, self._model, self._data = world, solver.mj_model, solver.mj_data
+        labels = solver.model.shape_label
+        self._owners = shape_owners([labels[shape] for shape in solver.mjc_geom_to_newton_shape.numpy()[0]])
+        self._data.qpos[:] = initial_joints(world)
+        mujoco.mj_forward(self._model, self._data)
+        self._frames = [self._record()]
+
+    @property
+    def frame_count(self) -> int:
+        """Number of frames so far."""
+        return len(self._frames)
+
+    def step(self, action: np.ndarray) -> None:
+        """Step through canonical commands [t 16], of which the first is the one in force."""
+        for targets in control_targets(self.world.robot, action):
+            for target in targets:
+                self._data.ctrl[:] = target
+                mujoco.mj_step(self._model, self._data)
+            self._frames.append(self._record())
+
+    def motion(self) -> Motion:
+        """The motion so far."""
+        qpos, qvel, contact, penetration, overlap = (np.stack(parts) for parts in zip(*self._frames, strict=True))
+        overflow = any(warning.number for warning in self._data.warning)
+        return motion(self.world, qpos, qvel, contact, penetration, overlap.max(0), overflow)
+
+    def _record(self) -> "Frame":
+        return _record_frame(self._data, self._owners, len(self.world.scene.objects))
+
+
 def simulate_one(world: World) -> Motion:
     """Step one world through its commands."""
-    convert_quickly()
-    solver = build_solver([world], "cpu", use_mujoco_cpu=True)
-    model, data = solver.mj_model, solver.mj_data
-    labels = solver.model.shape_label
-    owners = shape_owners([labels[shape] for shape in solver.mjc_geom_to_newton_shape.numpy()[0]])
-    data.qpos[:] = initial_joints(world)
-    mujoco.mj_forward(model, data)
-    count = len(world.scene.objects)
-    frames = [_record_frame(data, owners, count)]
-    for targets in control_targets(world.robot, world.action):
-        for target in targets:
-            data.ctrl[:] = target
-            mujoco.mj_step(model, data)
-        frames.append(_record_frame(data, owners, count))
-    qpos, qvel, contact, penetration, overlap = (np.stack(parts) for parts in zip(*frames, strict=True))
-    overflow = any(warning.number for warning in data.warning)
-    return motion(world, qpos, qvel, contact, penetration, overlap.max(0), overflow)
+    stepper = Stepper(world)
+    stepper.step(world.action)
+    return stepper.motion()
 
 
 Frame = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]

@@ -12,6 +12,7 @@ import numpy as np
 
 from xew.concurrency import PARSING
 from xew.protocol import ARMS
+from xew.sim_warp.devices.workers import quiet_warp
 from xew.sim_warp.embodiment.spec import RobotSpec
 from xew.sim_warp.geometry.camera import HEAD_CAMERA, Camera, look_at, project
 from xew.sim_warp.geometry.meshes import Color
@@ -65,15 +66,19 @@ class CommandStreams:
     """[t h w 2] float32 motion from this frame to the next [pixels], see `Frames.optical_flow`."""
 
 
-def default_renderer() -> Renderer:
-    """The process's shared renderer on Warp's default device, created at first use."""
-    with PARSING:  # Warp's devices and `cache` are not thread-safe at first use
-        return _make_default_renderer()
+def default_renderer(frames_per_chunk: int | None = None) -> Renderer:
+    """The process's shared renderer on Warp's default device.
+
+    The first call silences Warp and creates the renderer, with so many frames in flight.
+    """
+    with PARSING:  # Warp's devices are not thread-safe at first use
+        if not _shared:
+            quiet_warp()
+            _shared.append(Renderer(frames_per_chunk=frames_per_chunk))
+        return _shared[0]
 
 
-@cache
-def _make_default_renderer() -> Renderer:
-    return Renderer()
+_shared: list[Renderer] = []
 
 
 def command_streams(robot: RobotSpec, action: np.ndarray, camera: Camera = HEAD_CAMERA, colors: bool = True) -> CommandStreams:
