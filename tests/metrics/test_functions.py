@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from xew.metrics import METRICS
+from xew.metrics.grade import JUDGED
 from xew.metrics.track import LARGEST, SIDE, failure_distance
-from xew.metrics.truth import JUDGED
 
 rng = np.random.default_rng(6)
 T, H, W, K = 3, 33, 47, 4

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from xew.metrics import METRICS, ndtw
+from xew.metrics.grade import JUDGED
 from xew.metrics.metric import Total, total_of
 from xew.metrics.perceptual import union_box
-from xew.metrics.truth import JUDGED
 
 rng = np.random.default_rng(5)
 FRAMES = 4

@@ -12,7 +12,7 @@ import pytest
 from jax.sharding import PartitionSpec
 
 from xew.metrics import METRICS, boundary_f1, mask_iou, pck, psnr, region_lpips, ssim
-from xew.metrics.truth import JUDGED
+from xew.metrics.grade import JUDGED
 
 rng = np.random.default_rng(8)
 T, SIDE, K = 2, 31, 3

@@ -21,13 +21,15 @@ from xew.metrics.estimators.appearance import REST as SCENE
 from xew.metrics.estimators.presence import confirm_tracks
 from xew.metrics.metric import fill_up
 from xew.metrics.perceptual import SMALLEST_SIDE, Box, lpips, region_lpips_frames, robot_lpips_frames, union_box
-from xew.metrics.truth import Points, Truth
+from xew.metrics.truth import OF_OUTCOME, Points, Truth
 
 TRACK_BLOCK, POINT_BLOCK = 64, 32
 """Numbers of frames and points that tracks are filled up to multiples of, so videos of all lengths and robots share a few
 programs: compiling one takes seconds, running it milliseconds."""
 ON_SURFACES = ("robot_points", "object_points")
 """Kinds of points that are tracked in one pass, by any tracker."""
+JUDGED = tuple(sorted(OF_OUTCOME))
+"""Kinds of inputs that rest on `Truth.outcome`, which asks for points on objects."""
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,7 @@ NEEDS = {
 """Arrays of an episode that each kind of comparison rests on; imported episodes may not know some."""
 OF_VARIANTS = frozenset({"variants", "variant_videos"})
 """Kinds of comparison with other commands in the scene."""
-JUDGED = OF_VARIANTS | {"outcome"}
+OF_OUTCOME = OF_VARIANTS | {"outcome"}
 """Kinds of comparison that rest on `Truth.outcome`, which asks for points on objects."""
 WITH_SURFACES = frozenset(NEEDS) - {"video", "region", "robot"}
 """Kinds of comparison that look for bodies, which surfaces tell apart."""
@@ -153,7 +153,7 @@ def read_truth(
             body_id=None,
             known=False,
         )
-    if surfaces is not None and surfaces.resting is not None and JUDGED & set(compared):
+    if surfaces is not None and surfaces.resting is not None and OF_OUTCOME & set(compared):
         points = surfaces.objects, surfaces.resting
         body, local = (np.concatenate([getattr(some, name) for some in points]) for name in ("body", "local"))
         names = [surfaces.names[number] for number in body]

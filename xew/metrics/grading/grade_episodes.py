@@ -14,12 +14,12 @@ import numpy as np
 from xew.episode import EpisodeError, read_record
 from xew.metrics.backends import Masker, Tracker
 from xew.metrics.episode_cache import EpisodeCache
-from xew.metrics.grade import ON_SURFACES, Comparison, Grades, grade, input_kind
+from xew.metrics.grade import JUDGED, ON_SURFACES, Comparison, Grades, grade, input_kind
 from xew.metrics.grading.baselines import BASELINES
 from xew.metrics.grading.codecs import ModelCodec
 from xew.metrics.grading.list_jobs import Job
 from xew.metrics.grading.settings import Args, GradingSettings
-from xew.metrics.truth import JUDGED, Truth, read_truth
+from xew.metrics.truth import Truth, read_truth
 from xew.protocol import CODEC_TRUTH, GROUND_TRUTH, split_fault
 from xew.rollout import Rollout, RolloutError, read_rollout_video, resize_frame
 

@@ -28,13 +28,12 @@ from xew.concurrency import (
 )
 from xew.config import admit, pick
 from xew.metrics.backends import MASKERS, TRACKERS, Masker, Tracker, open_masker, open_tracker
-from xew.metrics.grade import input_kind
+from xew.metrics.grade import JUDGED, input_kind
 from xew.metrics.grading.codecs import ModelCodec, open_codecs
 from xew.metrics.grading.grade_episodes import Grader, Group, GroupResult, ThreadResources, split_groups
 from xew.metrics.grading.list_jobs import Job
 from xew.metrics.grading.settings import GradingSettings
 from xew.metrics.grading.warm_up import Part, missing_parts, note_compiled
-from xew.metrics.truth import JUDGED
 
 PROCESSES = "XEW_EVALUATE_PROCESSES"
 """Environment variable by which tests set the number of processes."""

@@ -16,11 +16,11 @@ import xew
 from xew.files import cache_folder, write_text
 from xew.metrics import METRICS, perceptual
 from xew.metrics.episode_cache import EpisodeCache, is_on_cpu
-from xew.metrics.grade import ON_SURFACES, Comparison, grade, input_kind
+from xew.metrics.grade import JUDGED, ON_SURFACES, Comparison, grade, input_kind
 from xew.metrics.grading.list_jobs import Job
 from xew.metrics.grading.settings import GradingSettings
 from xew.metrics.metric import ACCELERATOR_CHUNK
-from xew.metrics.truth import JUDGED, Truth
+from xew.metrics.truth import Truth
 
 DEFAULT = "default"
 """Name of the estimators that run in Warp's kernels."""
