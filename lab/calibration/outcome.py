@@ -5,11 +5,12 @@ Writes <out>/outcome.md (tables by task, robot and case) and outcome.parquet (a 
        minute: run it again to go on where it stopped
        <data>-surfaces/, the points on surfaces, as `xew.metrics.evaluate` does
 
-Cases: the true video, through a codec if one is named; and a render in which no object moves, through H.264.
+Cases: the true video, through a codec if one is named; a render in which no object moves, through H.264; and of faulty commands
+a render in which objects move as under the expert's, as a model that has only seen success might show it.
 The rules, written before any result:
 * The judge has power on a task, and keeps it, if Pearson's r of judged and true progress is at least LEAST_R over INSTANTS
-  frames of each video, all robots and both cases together. All other tasks are left out for all models (`judge.UNJUDGED`),
-  those whose progress does not vary too.
+  frames of each video, all robots and the first two cases together. All other tasks are left out for all models
+  (`judge.UNJUDGED`), those whose progress does not vary too.
 * A video shows success from the progress on, of CANDIDATES, that gives most right verdicts over these frames of kept tasks; of
   equals, the middle one, or the lower of two.
 
@@ -35,7 +36,7 @@ from lab.calibration.predictors import hold_objects, through_h264
 from xew.concurrency import map_in_processes, visible_gpus
 from xew.config import ConfigError, user_errors
 from xew.dataset import demand_one_motion, find_accepted
-from xew.episode import EpisodeError, Record
+from xew.episode import EpisodeError, Record, States, data_folder, episode_folder, read_states
 from xew.files import hold_lock
 from xew.metrics.backends import Tracker, identity, open_masker, open_tracker
 from xew.metrics.episode_cache import EpisodeCache
@@ -48,15 +49,17 @@ from xew.metrics.outcome.judge import UNJUDGED
 from xew.metrics.outcome.measures import SHOWN
 from xew.metrics.outcome.variants import INSTANTS, instants
 from xew.metrics.truth import Truth, read_truth
-from xew.protocol import GRADING_PROTOCOL, HELD_OUT_ROBOTS
+from xew.protocol import GRADING_PROTOCOL, HELD_OUT_ROBOTS, split_fault
 from xew.statistics import pearson
 
 LEAST_R = 0.9
 """Least r of judged and true progress of a task that the judge keeps."""
 CANDIDATES = tuple(round(0.5 + 0.05 * step, 2) for step in range(11))
 """Progress from which on a video may show success."""
-CASES = ("truth", "object at rest")
-"""Videos of each episode."""
+CASES = ("truth", "object at rest", "objects of the expert")
+"""Videos of each episode; the last one of faulty episodes only."""
+OF_RULES = CASES[:2]
+"""The cases that the rules are about."""
 SECONDS_BETWEEN_WRITES = 60.0
 
 
@@ -80,6 +83,7 @@ def main(args: Args) -> None:
             "protocol": GRADING_PROTOCOL,
             "tracks": identity(args.tracks, args.tracks_checkpoint),
             "codec": codec.digest if codec else "H.264",
+            "cases": list(CASES),
         }
         rows = read_earlier(args.out / "outcome.parquet", made_by, chosen)
         done = {row["content"] for row in rows}
@@ -158,11 +162,23 @@ def judge_episode(
     key: Row = {"task": record.task, "seed": record.seed, "robot": record.robot, "content": content(record)}
     video = through_h264(truth.rgb) if codec is None else codec.reconstruct(folder, truth.rgb)
     rows = [key | {"case": CASES[0]} | row for row in judge_video(video, truth, tracker)]
-    still = hold_objects(truth.outcome.states)
-    video = through_h264(render_perturbation(folder, still).rgb)
-    wrong = [replace(truth.outcome, states=still).true_progress(frame) for frame in instants(len(video))]
-    judged = judge_video(video, truth, tracker)
-    return rows + [key | {"case": CASES[1]} | row | {"true": true} for row, true in zip(judged, wrong, strict=True)]
+    for case, states in zip(CASES[1:], change_objects(folder, record, truth.outcome.states), strict=False):
+        video = through_h264(render_perturbation(folder, states).rgb)
+        wrong = [replace(truth.outcome, states=states).true_progress(frame) for frame in instants(len(video))]
+        judged = judge_video(video, truth, tracker)
+        rows += [key | {"case": case} | row | {"true": true} for row, true in zip(judged, wrong, strict=True)]
+    return rows
+
+
+def change_objects(folder: Path, record: Record, states: States) -> Iterator[States]:
+    """States of an episode whose objects stay where they began; of a faulty one also those that move as the expert's do."""
+    yield hold_objects(states)
+    number, base = split_fault(record.seed)
+    expert = episode_folder(data_folder(folder), record.task, base, record.robot)
+    if number and expert.is_dir():
+        other = read_states(expert)
+        then = np.minimum(np.arange(states.frame_count), other.frame_count - 1)
+        yield replace(states, **{name: getattr(other, name)[then] for name in ("object_pose", "object_joint", "contact")})
 
 
 def judge_video(video: np.ndarray, truth: Truth, tracker: Tracker) -> Iterator[Row]:
@@ -176,23 +192,25 @@ def judge_video(video: np.ndarray, truth: Truth, tracker: Tracker) -> Iterator[R
 
 def report(rows: pd.DataFrame) -> str:
     """All tables in Markdown."""
-    by_task = {str(task): correlation(own) for task, own in rows.groupby("task")}
+    every, rows = rows, rows[rows["case"].isin(OF_RULES)]
+    by_task = {str(task): _correlation_text(own) for task, own in rows.groupby("task")}
     names = kept_tasks(rows)
     kept, left_out = rows[rows["task"].isin(names)], [task for task in by_task if task not in names]
     odd = sorted(set(UNJUDGED) & set(names) | set(left_out) - set(UNJUDGED))
-    videos = rows[KEY].drop_duplicates()
+    videos = every[KEY].drop_duplicates()
     tables = {
         "By task": agreement_table(rows, ["task"]),
         "By robot, of kept tasks": agreement_table(kept, ["robot"]),
-        "By case, of kept tasks": agreement_table(kept, ["case"]),
+        "By case, of kept tasks": agreement_table(every[every["task"].isin(names)], ["case"]),
         "Pearson's r by task and robot": correlation_table(rows),
         "By task and robot": agreement_table(rows, ["task", "robot"]),
     }
     parts = [
         f"Judged and true progress in {INSTANTS} frames of each of {len(videos)} videos, of {rows['content'].nunique()} "
-        "episodes. Successes and failures are counted in the last frame of each video.",
+        f"episodes. Successes and failures are counted in the last frame of each video. All but the table by case is of "
+        f"{' and '.join(OF_RULES)}.",
         f"Kept are {len(names)} of {len(by_task)} tasks, whose r is at least {LEAST_R}: {', '.join(names) or 'none'}.",
-        f"Left out are: {', '.join(f'{task} (r {by_task[task]:.3f})' for task in left_out) or 'none'}.",
+        f"Left out are: {', '.join(f'{task} (r {by_task[task]})' for task in left_out) or 'none'}.",
         f"The metrics' list of tasks that are left out (UNJUDGED) is wrong about: {', '.join(odd) or 'none'}.",
         f"Success is shown from {best_threshold(kept)} on (metrics use {SHOWN})." if names else "",
         *(part for title, table in tables.items() if len(table) for part in (f"### {title}", as_markdown(table))),
@@ -210,6 +228,11 @@ def correlation(rows: pd.DataFrame) -> float:
     return float(pearson(rows["judged"].to_numpy(), rows["true"].to_numpy()))
 
 
+def _correlation_text(rows: pd.DataFrame) -> str:
+    r = correlation(rows)
+    return "-" if np.isnan(r) else f"{r:.3f}"
+
+
 def best_threshold(rows: pd.DataFrame) -> float:
     """The one of CANDIDATES that gives most right verdicts; of equals, the middle one, or the lower of two."""
     right = [((rows["judged"] >= shown) == (rows["true"] >= 1)).mean() for shown in CANDIDATES]
@@ -224,7 +247,7 @@ def agreement_table(rows: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
         last = own.loc[own.groupby(KEY)["frame"].idxmax()]
         judged, true = last["judged"] >= SHOWN, last["true"] >= 1
         table[" ".join(map(str, names))] = {
-            "r": f"{correlation(own):.3f}",
+            "r": _correlation_text(own),
             "progress error": f"{(own['judged'] - own['true']).abs().mean():.3f}",
             "success, judged so": str((true & judged).sum()),
             "success, judged failure": str((true & ~judged).sum()),
@@ -236,7 +259,7 @@ def agreement_table(rows: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
 
 def correlation_table(rows: pd.DataFrame) -> pd.DataFrame:
     """r of each task (rows) with each robot (columns)."""
-    table = {key: f"{correlation(own):.3f}" for key, own in rows.groupby(["task", "robot"])}
+    table = {key: _correlation_text(own) for key, own in rows.groupby(["task", "robot"])}
     return pd.Series(table).unstack().fillna("")
 
 

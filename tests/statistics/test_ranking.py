@@ -107,6 +107,13 @@ def test_rates_of_a_score_table_rank_the_expert_and_its_faults() -> None:
     assert set(table["policies"]) == {3} and set(table["scenes"]) == {4} and set(table["robot"]) == {"Piper"}
 
 
+def test_baselines_come_last_in_their_order() -> None:
+    rows = pd.DataFrame(score_rows({0: (1, 1), 1: (0, 0)}, {0: (1, 1), 1: (0, 0)}))
+    shuffled = pd.concat([rows.assign(model=model) for model in ("ground_truth", "mine", "copy_first_frame", "yours")])
+    ranking = rank_policies(shuffled, {"Piper": ["piper"]})
+    assert [*dict.fromkeys(ranking["model"])] == ["mine", "yours", "copy_first_frame", "ground_truth"]
+
+
 def test_experts_alone_are_not_ranked() -> None:
     expert = {0: (1, 1)}
     assert rank_policies(pd.DataFrame(score_rows(expert, expert)), {"Piper": ["piper"]}).empty

@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 from scipy.stats import rankdata
 
-from xew.protocol import FAULT_STRIDE
+from xew.protocol import BASELINES, FAULT_STRIDE
 from xew.statistics.bootstrap import Units, bootstrap_means
 from xew.statistics.means import Mean, fixed_mean
 
@@ -128,12 +128,14 @@ def rank_policies(rows: pd.DataFrame, groups: Mapping[str, Sequence[str]]) -> pd
         groups: robots that are pooled, by the name of the group.
 
     Returns:
-        robot model condition measure value low high policies scenes; empty where the table has no two policies.
+        robot model condition measure value low high policies scenes, baselines last; empty where the table has no two policies.
     """
     episodes = policy_outcomes(rows)
     table: list[tuple[Any, ...]] = []
+    place = {model: number for number, model in enumerate(BASELINES, 1)}
     for group, robots in groups.items():
-        for (model, condition), own in episodes[episodes["robot"].isin(robots)].groupby(["model", "condition"], sort=False):
+        models = episodes[episodes["robot"].isin(robots)].groupby(["model", "condition"], sort=False)
+        for (model, condition), own in sorted(models, key=lambda pair: place.get(pair[0][0], 0)):
             if own["policy"].nunique() > 1:
                 counts = own["policy"].nunique(), len(own[["task", "seed"]].drop_duplicates())
                 ranking = policy_ranking(own).items()

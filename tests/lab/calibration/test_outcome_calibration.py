@@ -9,10 +9,12 @@ import pytest
 
 from lab.calibration import outcome
 from lab.calibration.outcome import (
+    CASES,
     INSTANTS,
     Args,
     agreement_table,
     best_threshold,
+    change_objects,
     correlation_table,
     instants,
     judge_episode,
@@ -22,8 +24,10 @@ from lab.calibration.outcome import (
 )
 from tests.sim_warp.small import TASK, produce
 from xew.dataset import find_accepted
+from xew.episode import read_states
 from xew.metrics.backends import open_tracker
 from xew.metrics.grading.open_graders import PROCESSES
+from xew.protocol import join_fault
 from xew.sim_warp.production.cells import Job
 from xew.sim_warp.rendering.render import Renderer
 
@@ -64,7 +68,7 @@ def test_the_table_counts_right_and_wrong_verdicts() -> None:
 def test_the_report_names_tasks_without_power() -> None:
     text = report(ROWS)
     assert "Kept are 1 of 3 tasks, whose r is at least 0.9: good." in text
-    assert "Left out are: bad (r -0.148), blind (r nan)." in text
+    assert "Left out are: bad (r -0.148), blind (r -)." in text
     assert "(UNJUDGED) is wrong about: bad, blind." in text
 
 
@@ -75,6 +79,26 @@ def test_an_episode_gives_rows_of_both_cases(tmp_path: Path) -> None:
     assert table["case"].tolist() == ["truth"] * INSTANTS + ["object at rest"] * INSTANTS
     assert table["frame"].tolist() == 2 * instants(12).tolist()
     np.testing.assert_array_equal(table["true"], table["judged"], "success is by the commands alone")
+
+
+def test_objects_of_faulty_commands_also_move_as_the_expert_s(tmp_path: Path) -> None:
+    produce([Job(TASK, 1, ("piper",))], tmp_path, Renderer("cpu"))
+    [(folder, record)] = find_accepted(tmp_path)
+    expert = read_states(folder)
+    faulty = replace(expert, object_pose=expert.object_pose + 0.1)
+    [still] = change_objects(folder, record, expert)
+    assert (still.object_pose == expert.object_pose[0]).all()
+    still, success = change_objects(folder, replace(record, seed=join_fault(3, 1), fault="push:40"), faulty)
+    assert (still.object_pose == faulty.object_pose[0]).all()
+    np.testing.assert_array_equal(success.object_pose, expert.object_pose)
+    np.testing.assert_array_equal(success.joint_pos, faulty.joint_pos)
+
+
+def test_the_rules_are_about_the_first_two_cases() -> None:
+    wrong = ROWS.assign(case=CASES[2], judged=0.0)
+    text = report(pd.concat([ROWS, wrong]))
+    assert "Kept are 1 of 3 tasks, whose r is at least 0.9: good." in text
+    assert text.count(CASES[2]) == 1 and f"| {CASES[2]} | - | 0.540 | 0 | 1 | 0 | 0 |" in text
 
 
 def test_the_command_goes_on_where_it_stopped(

@@ -29,12 +29,16 @@ class Variant:
     """[t o 7] as in `States`."""
     object_joint: np.ndarray
     """[t o] rad."""
+    given: np.ndarray
+    """[h w 3] uint8, the first frame."""
     rgb: np.ndarray
     """[n h w 3] uint8, at the instants."""
     shown: np.ndarray
     """[n h w] int, the body that each pixel shows, -1 for any other."""
     moved: np.ndarray
     """[b] bool, the objects and lids among these bodies that move."""
+    robot: np.ndarray
+    """[n h w] bool, the robot's mask."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,21 +61,23 @@ class CommandVariants:
 
     @cached_property
     def moving(self) -> np.ndarray:
-        """[n h w] bool, pixels that show, under any variant, an object that moves under any variant.
+        """[n h w] bool, pixels that show an object under any variant that moves under any, and the robot under none.
 
-        One region for the whole set, so distances from different truths compare. It leaves the robot out, which follows the
-        commands whatever they cause.
+        One region for the whole set, so distances from different truths compare. The robot follows the commands whatever they
+        cause: a render of it alone would be retrieved where it hides objects.
         """
         moved = np.append(np.any([variant.moved for variant in self.variants], axis=0), False)
-        return np.any([moved[variant.shown] for variant in self.variants], axis=0)
+        shown = np.any([moved[variant.shown] for variant in self.variants], axis=0)
+        return shown & ~np.any([variant.robot for variant in self.variants], axis=0)
 
     def perceptual_distances(self, video: np.ndarray) -> np.ndarray:
         """LPIPS [v] float32 of a video [t h w 3] uint8 from the truth of each variant, in the moving regions.
 
-        Mean over INSTANTS frames. A truth that ends earlier stands still.
+        Mean over INSTANTS frames. A truth that ends earlier stands still. Outside of the regions all show the first frame,
+        because LPIPS looks far beyond a region, where the robot's motion would say which commands these are.
         """
         truths, described = self._truths
-        own = np.asarray(lpips_embedding(video[instants(self.frames)], self.moving))
+        own = self._describe(video[instants(self.frames)])
         near, beyond = np.square(truths - own[described]), np.square(own[~described])
         total = near.sum(axis=1, dtype=np.float64) + beyond.sum(dtype=np.float64)  # of millions of numbers
         return (total / max(1, self.moving.any(axis=(1, 2)).sum())).astype(np.float32)
@@ -79,9 +85,14 @@ class CommandVariants:
     @cached_property
     def _truths(self) -> tuple[np.ndarray, np.ndarray]:
         """Features of all truths, and where [n d] bool they are: elsewhere, as outside of the region, all truths have 0."""
-        features = np.stack([lpips_embedding(variant.rgb, self.moving) for variant in self.variants])
+        features = np.stack([self._describe(variant.rgb) for variant in self.variants])
         described = np.any(features != 0, axis=0)
         return features[:, described], described
+
+    def _describe(self, frames: np.ndarray) -> np.ndarray:
+        """Features [n d] float32 of the regions of frames [n h w 3] uint8."""
+        regions = np.where(self.moving[..., None], frames, self.variants[0].given)
+        return np.asarray(lpips_embedding(regions, self.moving))
 
 
 def find_variants(folder: Path, record: Record, frames: int, surfaces: Path | None) -> tuple[CommandVariants | None, int]:
@@ -123,5 +134,7 @@ def _read_variant(folder: Path, frames: int, surfaces: Path | None) -> Variant:
     assert tracks is not None, "the shapes of one episode of the scene are known"
     shown = np.minimum(instants(frames), record.frame_count - 1)
     moved = (tracks.displacement[:frames].max(axis=0) > MOVED) & ~tracks.is_robot
-    rgb = read_pixels(folder, "rgb", record=record)[shown]
-    return Variant(states.object_pose, states.object_joint, rgb, tracks.shown[shown], moved)
+    rgb = read_pixels(folder, "rgb", record=record)
+    return Variant(
+        states.object_pose, states.object_joint, rgb[0], rgb[shown], tracks.shown[shown], moved, states.robot_mask[shown]
+    )
