@@ -135,7 +135,7 @@ def rank_policies(rows: pd.DataFrame, groups: Mapping[str, Sequence[str]]) -> pd
     place = {model: number for number, model in enumerate(BASELINES, 1)}
     for group, robots in groups.items():
         models = episodes[episodes["robot"].isin(robots)].groupby(["model", "condition"], sort=False)
-        for (model, condition), own in sorted(models, key=lambda pair: place.get(pair[0][0], 0)):
+        for (model, condition), own in sorted(models, key=lambda pair: place.get(str(pair[0][0]), 0)):
             if own["policy"].nunique() > 1:
                 counts = own["policy"].nunique(), len(own[["task", "seed"]].drop_duplicates())
                 ranking = policy_ranking(own).items()
