@@ -38,7 +38,7 @@ GROUND = {"", "statistics", "video", "policies"}
 LAZILY = {
     ("model", "sim_warp"): ("conditions", "latents", "cache", "episodes", "devices.parts", "video"),
     ("model", "metrics"): ("codecs.ceiling", "conditions", "training.samples", "weights.reading"),
-    ("metrics", "sim_warp"): ("truth", "outcome.judge"),
+    ("metrics", "sim_warp"): ("truth", "outcome.judge", "outcome.variants"),
 }
 """Modules and packages of the first room that may import the second, and inside functions alone: the room loads without it."""
 FORBIDDEN = {
@@ -387,9 +387,8 @@ def test_an_entry_of_the_registry_of_metrics_agrees_with_its_function() -> None:
     metrics = importlib.import_module("xew.metrics")
     kinds = importlib.import_module("xew.metrics.metric")
     masked = {kind: ["target_mask"] for kind in ("region", "robot", "bodies")}
-    others: dict[str, list[str]] = (
-        {"track": ["valid"]} | {kind: [] for kind in ("video", "mask", "outcome", "variants")} | masked
-    )
+    of_two = ("video", "mask", "outcome", "variants", "variant_videos")
+    others: dict[str, list[str]] = {"track": ["valid"]} | {kind: [] for kind in of_two} | masked
     assert set(others) == set(kinds.INPUTS)
     for name, metric in metrics.METRICS.items():
         exported = metric.function.__name__
@@ -397,7 +396,7 @@ def test_an_entry_of_the_registry_of_metrics_agrees_with_its_function() -> None:
         taken = ["prediction", "target", *others[metric.inputs]]
         for function in filter(None, (metric.function, metric.curve, metric.parts)):
             assert list(inspect.signature(function).parameters)[: len(taken)] == taken, name
-        assert (metric.curve is None) == (metric.inputs in ("track", "variants")), name
+        assert (metric.curve is None) == (metric.inputs in ("track", "variants", "variant_videos")), name
         assert metric.range[0] < metric.range[1] and metric.dimension and metric.reference, name
         assert metric.suites and set(metric.suites) <= set(kinds.SUITES) and metric.points in kinds.POINTS, name
         options = inspect.signature(metric.function).parameters

@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
@@ -23,6 +24,7 @@ from xew.protocol import (
     SHOTS,
     SPLITS,
     TASK_COUNT,
+    TASK_GROUPS,
     TEST_SEED_START,
     TRAINING_BODIES,
     UNSEEN_BODIES,
@@ -51,6 +53,13 @@ def count(variant: Variant, robots: tuple[str, ...]) -> int:
 
 def test_the_suite_has_25_tasks() -> None:
     assert len(TASKS) == TASK_COUNT == 25
+
+
+def test_each_task_is_of_one_group_as_on_its_page() -> None:
+    page = (Path(__file__).parents[1] / "docs" / "tasks.md").read_text("utf-8").splitlines()
+    rows = {f"| {group} | {', '.join(f'`{task}`' for task in tasks)} |" for group, tasks in TASK_GROUPS.items()}
+    assert rows <= set(page)
+    assert sorted(task for tasks in TASK_GROUPS.values() for task in tasks) == sorted(TASKS)
 
 
 @pytest.mark.parametrize("part", ["fixed", "actions", "ladder", "baselines"])

@@ -132,6 +132,33 @@ FINAL_SEED_START = 2_000_000
 them unless it is asked for the family `final`: the scenes of `test` were looked at while recipes were made."""
 SEED_STARTS = {"train": 0, "validation": VALIDATION_SEED_START, "test": TEST_SEED_START, "final": FINAL_SEED_START}
 """First seed of each family."""
+TASK_GROUPS = {
+    "place an object": (
+        "place_a2b_left",
+        "place_a2b_right",
+        "place_container_plate",
+        "place_empty_cup",
+        "place_mouse_pad",
+        "place_object_scale",
+        "place_object_stand",
+        "place_phone_stand",
+        "move_can_pot",
+        "move_pillbottle_pad",
+        "move_stapler_pad",
+    ),
+    "place several objects": (
+        "blocks_ranking_rgb",
+        "blocks_ranking_size",
+        "place_bread_basket",
+        "place_burger_fries",
+        "place_dual_shoes",
+        "stack_bowls_two",
+    ),
+    "both hands at one object": ("grab_roller", "lift_pot"),
+    "use a tool or a mechanism": ("beat_block_hammer", "open_laptop", "press_stapler", "stamp_seal"),
+    "move without placing": ("shake_bottle", "shake_bottle_horizontally"),
+}
+"""Tasks by what hands do in them (docs/tasks.md)."""
 FAULT_STRIDE = 10_000_000
 """Distance between the seed of an expert's episode and those of its faults 1, 2, ..., all of which have its scene."""
 

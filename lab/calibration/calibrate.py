@@ -14,9 +14,10 @@ Predictors: videos made on purpose, from the true one to a gray one, and whether
     python -m lab.calibration --data data --predictors --out calibration
 """
 
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import combinations, zip_longest
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +40,7 @@ from xew.metrics.grade import Comparison, Grades, grade, input_kind
 from xew.metrics.grading.codecs import ModelCodec, open_codecs
 from xew.metrics.grading.settings import WITHOUT_OUTCOME
 from xew.metrics.truth import NEEDS, Truth, read_truth
-from xew.protocol import seed_split
+from xew.protocol import seed_split, split_fault
 
 LATE = 8
 """Number of frames by which the true video is shifted, half a second."""
@@ -198,12 +199,17 @@ def choose(episodes: Sequence[Episode], args: CommonArgs) -> list[Episode]:
 
 
 def _take_turns(episodes: Sequence[Episode]) -> list[Episode]:
-    """Episodes of robots in alternation, with different starts: the first few are of many robots and tasks."""
-    queues = []
-    for index, robot in enumerate(dict.fromkeys(record.robot for _, record in episodes)):
-        own = [episode for episode in episodes if episode[1].robot == robot]
-        queues.append([*own[index % len(own) :], *own[: index % len(own)]])
-    return [episode for turn in zip_longest(*queues) for episode in turn if episode is not None]
+    """Episodes of tasks in alternation, each task with another robot first and each robot with another seed.
+
+    The first few are of many tasks and robots. Of a task and robot, the commands of a scene follow one another.
+    """
+    robots, tasks = (list(dict.fromkeys(getattr(record, name) for _, record in episodes)) for name in ("robot", "task"))
+    queues: dict[tuple[int, int], list[Episode]] = defaultdict(list)
+    for episode in sorted(episodes, key=lambda episode: split_fault(episode[1].seed)[::-1]):
+        queues[tasks.index(episode[1].task), robots.index(episode[1].robot)].append(episode)
+    places = [(turn, (robot - task) % len(robots), task) for (task, robot), own in queues.items() for turn in range(len(own))]
+    in_turn = [own[(turn + robot) % len(own)] for (_, robot), own in queues.items() for turn in range(len(own))]
+    return [in_turn[number] for number in sorted(range(len(places)), key=places.__getitem__)]
 
 
 def reference_videos(

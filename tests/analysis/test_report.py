@@ -4,6 +4,7 @@ import base64
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
+from itertools import product
 from pathlib import Path
 
 import cv2
@@ -28,13 +29,13 @@ from xew.analysis.report import (
 )
 from xew.analysis.reports import charts
 from xew.analysis.reports.run_tables import Interval, RobotTable, Row
-from xew.analysis.reports.study_charts import run_chart
+from xew.analysis.reports.study_charts import ranking_chart, run_chart
 from xew.analysis.scores import MetricInfo, read_scores
 from xew.analysis.tables import formats
 from xew.config import ConfigError
 from xew.episode import Record, write_video
 from xew.metrics import evaluate
-from xew.protocol import join_fault
+from xew.protocol import COPY_FIRST_FRAME, join_fault
 from xew.rollout import find_rollouts, read_rollout_video
 
 VOID = {"meta", "img", "br", "hr", "link", "input"}
@@ -344,3 +345,25 @@ def test_policies_are_ranked_in_a_table_of_their_own() -> None:
     assert [section.title for section in ranking.sections] == ["Piper"] and "2 policies" in ranking.caption
     assert "| mine · flow | 1.000 | 1.000 | 0.000 |" in formats.markdown(ranking)
     assert ranking_tables(pd.DataFrame(rows[:3]), [table]) == [], "the expert alone"
+
+
+def test_policies_are_points_of_true_and_judged_rates() -> None:
+    rows = []
+    tasks = {"place_mouse_pad": ("place an object", 1.0), "lift_pot": ("both hands at one object", 0.0)}
+    tasks |= {"mine": ("other tasks", 0.5)}
+    for task, (fault, seed, robot) in product(tasks, product((0, 3), range(2), ("piper", "arx_x5"))):
+        key = {"model": "mine", "condition": "flow", "task": task, "seed": join_fault(fault, seed), "robot": robot}
+        shown = not fault or seed < 2 * tasks[task][1]
+        rows += [key | {"metric": "outcome_accuracy", "value": float(shown != bool(fault))}]
+        rows += [key | {"metric": "hallucinated_success", "value": float(shown)}] if fault else []
+    rows += [row | {"model": COPY_FIRST_FRAME, "value": 0.0} for row in rows]
+    chart = ranking_chart(pd.DataFrame(rows), {"Pooled: ARX": ("arx_x5",), "Piper": ("piper",)})
+    assert [panel.title for panel in chart.panels] == ["Pooled: ARX", "Piper"]
+    assert [series.label for series in chart.legend] == [group for group, _ in tasks.values()]
+    judged = chart.data[chart.data["policy"] == 3].set_index(["robots", "tasks"])[["true", "judged", "episodes"]]
+    assert {key: tuple(row) for key, row in zip(judged.index, judged.to_numpy(), strict=True)} == {
+        (robots, group): (0, rate, 2) for robots in ("Pooled: ARX", "Piper") for group, rate in tasks.values()
+    }
+    axes = Figure().subplots()
+    chart.panels[0].draw(axes)
+    assert [len(points.get_offsets()) for points in axes.collections] == [2, 2, 2]

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from xew.metrics import METRICS
+from xew.metrics.grade import JUDGED
 from xew.metrics.track import LARGEST, SIDE, failure_distance
 
 rng = np.random.default_rng(6)
@@ -42,7 +43,7 @@ WILD_TRACKS = {
     "at the corner": np.zeros_like,
 }
 WILD_NUMBERS = {"none": np.zeros_like, "all": np.ones_like, "inverse": lambda numbers: 1 - numbers}
-WILD = {"mask": WILD_MASKS, "track": WILD_TRACKS, "outcome": WILD_NUMBERS, "variants": WILD_NUMBERS}
+WILD = {"mask": WILD_MASKS, "track": WILD_TRACKS, **dict.fromkeys(JUDGED, WILD_NUMBERS)}
 """What a prediction can be at worst, by kind of input; else WILD_VIDEOS."""
 WILD_CASES = [(name, case) for name, metric in METRICS.items() for case in WILD.get(metric.inputs, WILD_VIDEOS)]
 
@@ -51,7 +52,7 @@ def inputs(kind: str) -> tuple[np.ndarray, ...]:
     masks = rng.random((2, T, H, W)) < 0.5
     if kind == "mask":
         return tuple(masks)
-    if kind in ("outcome", "variants"):
+    if kind in JUDGED:
         return rng.random(T, np.float32), np.float32([1, 0, 0.5])
     if kind == "track":
         target = rng.uniform(0, 40, (T, K, 2)).astype(np.float32)

@@ -161,6 +161,19 @@ def test_embeddings_are_as_far_apart_as_frames() -> None:
         lpips_embedding(noise(1, 30, 56))
 
 
+def test_embeddings_of_regions_are_as_far_apart_as_the_regions() -> None:
+    a, b, mask = noise(3), noise(3), np.zeros((3, 40, 56), bool)
+    mask[0, 5:20, 10:30] = mask[1, 30:, 50:] = True
+    first, second = (np.asarray(lpips_embedding(video, mask)) for video in (a, b))
+    apart = np.square(first - second).sum(axis=1)
+    np.testing.assert_allclose(apart[:2], robot_lpips_frames(a, b, mask)[:2], rtol=1e-5)
+    assert apart[2] == 0, "nothing is in its region"
+    everywhere = np.square(lpips_embedding(a, np.ones_like(mask)) - lpips_embedding(b, np.ones_like(mask))).sum(axis=1)
+    np.testing.assert_allclose(everywhere, lpips(a, b), rtol=1e-5)
+    with pytest.raises(ValueError, match="target_mask"):
+        lpips_embedding(a, mask[:2])
+
+
 @pytest.mark.parametrize("most_bytes", [10**9, 0])
 @pytest.mark.parametrize("block", [1, 3])
 def test_features_shared_by_three_metrics_and_all_predictions_change_no_value(

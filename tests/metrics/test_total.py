@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from xew.metrics import METRICS, ndtw
+from xew.metrics.grade import JUDGED
 from xew.metrics.metric import Total, total_of
 from xew.metrics.perceptual import union_box
 
@@ -29,7 +30,7 @@ def inputs(kind: str) -> tuple[np.ndarray, ...]:
     """All frames, the first of them exact."""
     if kind == "mask":
         return masks(), masks()
-    if kind in ("outcome", "variants"):
+    if kind in JUDGED:
         return rng.random(FRAMES, np.float32), rng.random(FRAMES, np.float32)
     if kind == "track":
         target = rng.uniform(0, 60, (FRAMES, 3, 2)).astype(np.float32)

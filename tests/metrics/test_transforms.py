@@ -12,6 +12,7 @@ import pytest
 from jax.sharding import PartitionSpec
 
 from xew.metrics import METRICS, boundary_f1, mask_iou, pck, psnr, region_lpips, ssim
+from xew.metrics.grade import JUDGED
 
 rng = np.random.default_rng(8)
 T, SIDE, K = 2, 31, 3
@@ -28,7 +29,7 @@ def inputs(kind: str, dtype: type = np.float32) -> Arrays:
     masks[0, :, :9] = False
     if kind == "mask":
         return tuple(masks)
-    if kind in ("outcome", "variants"):
+    if kind in JUDGED:
         return tuple(rng.random((2, T)).astype(dtype))
     if kind == "track":
         target = rng.uniform(0, SIDE, (T, K, 2)).astype(dtype)
@@ -136,7 +137,7 @@ def test_nan_goes_through(name: str) -> None:
     """One channel of the last pixel, which no window of LPIPS reaches; of tracks, a true point that ought to be visible."""
     metric, kind = METRICS[name], METRICS[name].inputs
     arrays = inputs(kind)
-    place = {"track": (1, 1, 0), "outcome": (1,), "variants": (1,)}.get(kind, (1, -1, -1, 2))
+    place = {"track": (1, 1, 0), **dict.fromkeys(JUDGED, (1,))}.get(kind, (1, -1, -1, 2))
     arrays[1 if kind == "track" else 0][place] = np.nan
     assert np.isnan(np.mean(metric.function(*arrays)))
     assert name == "trajectory_error" or np.isnan(metric.total(*arrays).mean)

@@ -6,7 +6,15 @@ import pytest
 from scipy.stats import pearsonr, spearmanr
 
 from xew.protocol import join_fault
-from xew.statistics.ranking import RANKINGS, mean_max_rank_violation, policy_ranking, rank_policies
+from xew.statistics.means import fixed_mean
+from xew.statistics.ranking import (
+    RANKINGS,
+    mean_max_rank_violation,
+    policy_outcomes,
+    policy_ranking,
+    rank_policies,
+    ranking_interval,
+)
 
 
 @pytest.mark.parametrize(
@@ -51,6 +59,30 @@ def test_policies_are_ranked_by_their_rates_with_intervals_over_scenes() -> None
         assert low <= mean.value <= high and high > low
 
 
+@pytest.mark.parametrize(
+    ("name", "value", "draws", "expected"),
+    [
+        ("mmrv", 0.1, (0.12, 0.3), (0.0, 0.3)),  # mirrored: -0.1 to 0.08
+        ("mmrv", 0.1, (0.05, 0.12), (0.05, 0.15)),
+        ("pearson", np.tanh(1.0), (np.tanh(0.4), np.tanh(0.9)), (np.tanh(0.4), np.tanh(1.6))),
+        ("spearman", 1.0, (0.9, 1.0), (0.9, 1.0)),
+    ],
+)
+def test_intervals_reach_as_far_to_the_other_side(
+    name: str, value: float, draws: tuple[float, float], expected: tuple[float, float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mean = fixed_mean(np.array([value, *draws]), 10, 10)
+    monkeypatch.setattr(type(mean), "interval", lambda _: draws)
+    assert ranking_interval(name, mean) == pytest.approx(expected)
+
+
+def test_scenes_are_all_that_any_policy_has() -> None:
+    rows = ranking_rows()
+    rare = rows[(rows["policy"] != 2) | (rows["seed"] < 3)]
+    low, high = policy_ranking(rare)["pearson"].interval()
+    assert low < high, "a policy of three scenes alone would have no interval"
+
+
 def test_one_policy_has_no_rank() -> None:
     with pytest.raises(ValueError, match="1 policies to rank"):
         policy_ranking(ranking_rows().query("policy == 1"))
@@ -75,6 +107,26 @@ def test_rates_of_a_score_table_rank_the_expert_and_its_faults() -> None:
     assert set(table["policies"]) == {3} and set(table["scenes"]) == {4} and set(table["robot"]) == {"Piper"}
 
 
+def test_baselines_come_last_in_their_order() -> None:
+    rows = pd.DataFrame(score_rows({0: (1, 1), 1: (0, 0)}, {0: (1, 1), 1: (0, 0)}))
+    shuffled = pd.concat([rows.assign(model=model) for model in ("ground_truth", "mine", "copy_first_frame", "yours")])
+    ranking = rank_policies(shuffled, {"Piper": ["piper"]})
+    assert [*dict.fromkeys(ranking["model"])] == ["mine", "yours", "copy_first_frame", "ground_truth"]
+
+
 def test_experts_alone_are_not_ranked() -> None:
     expert = {0: (1, 1)}
     assert rank_policies(pd.DataFrame(score_rows(expert, expert)), {"Piper": ["piper"]}).empty
+
+
+def test_a_policy_without_a_rate_is_left_out() -> None:
+    rates = np.array([[0.2, np.nan, 0.5, 0.9], [0.1, np.nan, 0.8, 0.4]])
+    for name, function in RANKINGS.items():
+        assert function(*rates) == pytest.approx(function(*rates[:, [0, 2, 3]])), name
+
+
+def test_outcomes_of_a_score_table() -> None:
+    rows = score_rows({0: (1, 0), 2: (1, 0)}, {0: (1, 1), 2: (0, 0)})
+    outcomes = policy_outcomes(pd.DataFrame(rows)).set_index(["policy", "seed"])
+    assert outcomes["true"].to_dict() == {(0, 0): 1, (0, 1): 1, (2, 0): 0, (2, 1): 0}
+    assert outcomes["judged"].to_dict() == {(0, 0): 1, (0, 1): 0, (2, 0): 1, (2, 1): 0}

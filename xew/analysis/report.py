@@ -35,7 +35,7 @@ from xew.analysis.reports import study as report_study
 from xew.analysis.reports.answer import answer, answer_strip, best_row, run_contests
 from xew.analysis.reports.charts import Chart, chart_files
 from xew.analysis.reports.run_tables import RobotTable, Row, finding, flat_summary, robot_table
-from xew.analysis.reports.study_charts import run_chart
+from xew.analysis.reports.study_charts import ranking_chart, run_chart
 from xew.analysis.reports.study_strips import Strip
 from xew.analysis.reports.study_text import curves_note, missing_note
 from xew.analysis.scores import TRUTH, MetricInfo, Scores, find_missing_scores, read_scores
@@ -200,20 +200,21 @@ def _report_scores(args: Args, scores: Scores) -> None:
     if args.explorer:
         _write_explorer(scores, args)
     curves = _curve_chart(scores, args.held_out)
-    ranking = ranking_tables(scores.rows, held_out + seen)
+    ranking, policies = ranking_tables(scores.rows, held_out + seen), _policies_chart(scores.rows, held_out + seen)
     sections = [
         *map(page.note, notes),
         _held_out_section(held_out, scores.metrics),
         _strip_section(strips, args),
         page.section("How the error grows with time", page.chart(curves)) if curves.panels else None,
         _seen_section(seen, scores.metrics),
-        _ranking_section(ranking),
+        _ranking_section(ranking, policies),
         _method_section(scores, args),
     ]
     sentences = finding(held_out, seen, scores.metrics)
     html = page.page(TITLE, sentences, [part for part in sections if part], _format_footer(scores.versions), first)
     notes += _caution_notes(held_out)
     drawn = chart_files(curves) | (chart_files(first.chart) if first.chart else {})
+    drawn |= chart_files(policies) if ranking else {}
     text, files = _write_markdown([first.sentence, *sentences], notes, held_out, seen, scores, strips, drawn, ranking)
     if len(missing):
         files["missing.csv"] = csv_text(missing).encode()
@@ -289,17 +290,17 @@ def ranking_tables(rows: pd.DataFrame, tables: Sequence[RobotTable]) -> list[Tab
         sections.append(TableSection(str(group), shown))
     caption = (
         f"Success rates of {ranking['policies'].max()} policies, the expert and its faults, in predicted video against their "
-        "rates in the simulator; 95 % intervals over scenes."
+        "rates in the simulator; 95 % intervals over scenes. r is not defined where all videos show success, or none does."
     )
     columns = tuple(map(Column, ("Pearson's r", "Spearman", "MMRV")))
-    return [Table("policy_ranking", RANKING, caption, ("model",), columns, tuple(sections))]
+    return [Table("policy_ranking", "Agreement of success rates", caption, ("model",), columns, tuple(sections))]
 
 
 def _ranking_row(model: str, condition: str, measures: pd.DataFrame) -> TableRow:
     cells = (
         TableCell(
-            f"{value:.3f}",
-            "" if np.isnan(low) else f"[{low:.3f}, {high:.3f}]",
+            "not defined" if np.isnan(value) else f"{value:.3f}",
+            "" if np.isnan(low) else f"{low:.3f}–{high:.3f}",
             value=value,
             low=low,
             high=high,
@@ -310,8 +311,13 @@ def _ranking_row(model: str, condition: str, measures: pd.DataFrame) -> TableRow
     return TableRow((" · ".join(filter(None, (BASELINES.get(model, model), condition))),), tuple(cells), model in BASELINES)
 
 
-def _ranking_section(tables: Sequence[Table]) -> Markup | None:
-    return page.section(RANKING, *map(page.table, tables)) if tables else None
+def _policies_chart(rows: pd.DataFrame, tables: Sequence[RobotTable]) -> Chart:
+    return ranking_chart(rows, {table.title: table.robots for table in tables})
+
+
+def _ranking_section(tables: Sequence[Table], policies: Chart) -> Markup | None:
+    shown = [*map(page.table, tables), *([page.chart(policies)] if policies.panels else [])]
+    return page.section(RANKING, *shown) if tables else None
 
 
 def run_table(table: RobotTable, metrics: Sequence[MetricInfo]) -> Table:

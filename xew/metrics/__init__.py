@@ -183,6 +183,11 @@ METRICS = {
         retrieval, None, "outcome", "", (0, 1), True, "variants",
         "whether objects move as under these commands rather than under other commands in the same scene; chance is 1/k",
         "Counterfactual retrieval", parts=retrieval_parts, suites=STRICT),
+    "retrieval_lpips": Metric(
+        retrieval, None, "outcome", "", (0, 1), True, "variant_videos",
+        "whether moving objects look as under these commands rather than under other commands in the same scene, by LPIPS; "
+        "chance is 1/k",
+        "Retrieval by LPIPS", parts=retrieval_parts, suites=STRICT),
 }  # fmt: skip
 """All metrics by name, in the order of the paper's dimensions."""
 

@@ -21,15 +21,15 @@ from xew.metrics.estimators.appearance import REST as SCENE
 from xew.metrics.estimators.presence import confirm_tracks
 from xew.metrics.metric import fill_up
 from xew.metrics.perceptual import SMALLEST_SIDE, Box, lpips, region_lpips_frames, robot_lpips_frames, union_box
-from xew.metrics.truth import Points, Truth
+from xew.metrics.truth import OF_OUTCOME, Points, Truth
 
 TRACK_BLOCK, POINT_BLOCK = 64, 32
 """Numbers of frames and points that tracks are filled up to multiples of, so videos of all lengths and robots share a few
 programs: compiling one takes seconds, running it milliseconds."""
 ON_SURFACES = ("robot_points", "object_points")
 """Kinds of points that are tracked in one pass, by any tracker."""
-JUDGED = ("outcome", "variants")
-"""Kinds of inputs that rest on a judge, who asks for points on objects."""
+JUDGED = tuple(sorted(OF_OUTCOME))
+"""Kinds of inputs that rest on `Truth.outcome`, which asks for points on objects."""
 
 
 @dataclass(frozen=True)
@@ -247,11 +247,25 @@ def _outcome(c: Comparison) -> Arrays | None:
 
 
 def _variants(c: Comparison) -> Arrays | None:
-    """Distances [k] of objects from where they are under k variants of the commands, of the prediction and of its truth."""
-    outcome, frames = c.truth.outcome, slice(c.episode.first, len(c.prediction))
-    if outcome is None or not outcome.is_judged or not outcome.variants:
+    """Distances [k] of objects from where they are under k variants of the commands, and 0 for the own variant, else 1."""
+    outcome = c.truth.outcome
+    if outcome is None or not outcome.is_judged or outcome.variants is None:
         return None
-    return tuple(outcome.distances(poses, frames) for poses in (c.judged_poses, outcome.true_poses(len(c.prediction))))
+    frames = slice(c.episode.first, len(c.prediction))
+    return outcome.distances(c.judged_poses, frames), _others(len(outcome.variants), outcome.own)
+
+
+def _variant_videos(c: Comparison) -> Arrays | None:
+    """LPIPS [k] from the true videos of k variants of the commands, in moving regions; the rest as of `_variants`."""
+    outcome = c.truth.outcome
+    if outcome is None or outcome.variants is None or min(c.prediction.shape[1:3]) < SMALLEST_SIDE:
+        return None
+    return outcome.variants.perceptual_distances(c.prediction), _others(len(outcome.variants), outcome.own)
+
+
+def _others(count: int, own: int) -> np.ndarray:
+    """[count] float32, 0 for the own one, 1 for the others."""
+    return (np.arange(count) != own).astype(np.float32)
 
 
 INPUTS: dict[str, Callable[[Comparison], Arrays | None]] = {
@@ -262,6 +276,7 @@ INPUTS: dict[str, Callable[[Comparison], Arrays | None]] = {
     "bodies": _bodies,
     "outcome": _outcome,
     "variants": _variants,
+    "variant_videos": _variant_videos,
     **{kind: functools.partial(_tracks, kind) for kind in ("keypoints", "objects", *ON_SURFACES)},
 }
 """Arrays that the functions of metrics take, by `input_kind`; None where the truth has nothing to compare."""

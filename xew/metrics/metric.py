@@ -32,11 +32,11 @@ Scalar: TypeAlias = Float32[jax.Array, ""]
 P = ParamSpec("P")
 R = TypeVar("R")
 
-INPUTS = ("video", "mask", "region", "robot", "bodies", "track", "outcome", "variants")
+INPUTS = ("video", "mask", "region", "robot", "bodies", "track", "outcome", "variants", "variant_videos")
 """Kinds of what a metric compares. video: two [t h w 3]. mask: two [t h w]. region: two videos and the union over time of the
 target's masks. robot: two videos and the target's masks frame by frame. bodies: the same with masks of the robot and all
 objects. track: two [t k 2], valid [t k]. outcome: two [t], the task's progress. variants: two [k], distances
-from what happens under k variants of the commands."""
+from what happens under k variants of the commands. variant_videos: the same, from the true videos of the variants."""
 ESTIMATED_INPUTS = ("mask", "track", "outcome", "variants")
 """Inputs that have to be estimated in a prediction."""
 SUITES = {

@@ -148,17 +148,23 @@ def robot_lpips_parts(
     return _weighted_distance(_weights(), prediction, target, mask, chunk), jnp.any(mask, axis=(1, 2))
 
 
-def check_video(video: Any) -> None:
-    """Raise ValueError or TypeError unless a video is [t h w 3] with sides that LPIPS takes."""
-    check_videos(video, video, SMALLEST_SIDE)
+def check_video(video: Any, target_mask: Any = None) -> None:
+    """Raise ValueError or TypeError unless a video is [t h w 3] with sides that LPIPS takes, and a mask is bool [t h w]."""
+    if target_mask is None:
+        check_videos(video, video, SMALLEST_SIDE)
+    else:
+        check_region(video, video, target_mask)
 
 
 @check_first(check_video)
-def lpips_embedding(video: Video, *, chunk: int | None = None) -> jax.Array:
+def lpips_embedding(video: Video, target_mask: Masks | None = None, *, chunk: int | None = None) -> jax.Array:
     """Vectors whose squared Euclidean distances are `lpips`: where all of many images are compared, each is described once.
+
+    With a mask, which all that are compared have to share, they are `robot_lpips_frames`: 0 where it is empty.
 
     Args:
         video: [t h w 3] RGB, uint8, or floating in [0, 1]; sides of at least 31 pixels.
+        target_mask: [t h w] bool, the region that counts; None for whole frames.
         chunk: as in `lpips`.
 
     Returns:
@@ -168,7 +174,7 @@ def lpips_embedding(video: Video, *, chunk: int | None = None) -> jax.Array:
         ValueError: the video has another shape, or a side is under 31 pixels.
         FileNotFoundError: the weights are not installed.
     """
-    return _embed(_weights(), video, chunk)
+    return _embed(_weights(), video, target_mask, chunk)
 
 
 class SharedFeatures:
@@ -401,12 +407,16 @@ def _box_features(weights: Weights, video: jax.Array, box: Box, chunk: int | Non
 
 
 @functools.partial(jax.jit, static_argnames="chunk")
-def _embed(weights: Weights, video: jax.Array, chunk: int | None) -> jax.Array:
-    """The features of whole frames, weighted so squared differences add up to LPIPS: [t d]."""
+def _embed(weights: Weights, video: jax.Array, mask: jax.Array | None, chunk: int | None) -> jax.Array:
+    """The features of whole frames, or of masked regions, weighted so squared differences add up to LPIPS: [t d]."""
     vectors = []
-    for i, layer in enumerate(_box_features(weights, video, _whole_box(video), chunk)):
-        weighted = layer * jnp.sqrt(weights[f"head{i}"] / (layer.shape[1] * layer.shape[2])).reshape(1, 1, 1, -1)
-        vectors.append(weighted.reshape(len(layer), -1))
+    layers = _box_features(weights, video, _whole_box(video), chunk)
+    for i, (layer, field_of_unit) in enumerate(zip(layers, _receptive_fields(weights), strict=True)):
+        shape = layer.shape[1:3]
+        share = jnp.ones((1, *shape)) if mask is None else _covered_share(mask, field_of_unit, shape)
+        area = jnp.sum(share, axis=(1, 2))[:, None, None, None]
+        weight = weights[f"head{i}"].reshape(1, 1, 1, -1) * share[..., None] / jnp.where(area > 0, area, 1)
+        vectors.append((layer * jnp.sqrt(weight)).reshape(len(layer), -1))
     return jnp.where(_is_broken(video)[:, None], jnp.nan, jnp.concatenate(vectors, axis=1))
 
 

@@ -4,15 +4,16 @@ Reads  <data>/<task>/<seed>/<robot>/ (xew.episode)
 """
 
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
-from xew.episode import EpisodeError, Record, demand_known, project, read_pixels, read_record, read_states
+from xew.episode import EpisodeError, Record, States, demand_known, project, read_pixels, read_record, read_states
 from xew.metrics.estimators.appearance import REST as SCENE
 from xew.metrics.outcome.judge import Outcome, know_outcome
+from xew.metrics.outcome.variants import find_variants
 
 OUTCOME_NEEDS = ("action", "tool_pose", "object_pose", "object_joint", "contact", "extrinsics", "intrinsics")
 NEEDS = {
@@ -27,21 +28,25 @@ NEEDS = {
     "object_points": ("object_pose", "extrinsics", "intrinsics"),
     "outcome": OUTCOME_NEEDS,
     "variants": OUTCOME_NEEDS,
+    "variant_videos": OUTCOME_NEEDS,
 }
 """Arrays of an episode that each kind of comparison rests on; imported episodes may not know some."""
-
+OF_VARIANTS = frozenset({"variants", "variant_videos"})
+"""Kinds of comparison with other commands in the scene."""
+OF_OUTCOME = OF_VARIANTS | {"outcome"}
+"""Kinds of comparison that rest on `Truth.outcome`, which asks for points on objects."""
 WITH_SURFACES = frozenset(NEEDS) - {"video", "region", "robot"}
 """Kinds of comparison that look for bodies, which surfaces tell apart."""
 
 REST = 1.0
 """Largest distance [pixels] by which a resting object's point may move."""
+MOVED = 0.01
+"""Distance from its first place [m] from which on an object has moved, so points on it count."""
 PATCH = 2
 """Number of pixels to each side of a point whose mean is the color of its place."""
 OTHER_COLOR = 40
 """Least difference [levels of a channel] that is another color. A shadow on a bright object may be one too: then its frames
 are left out, which costs little."""
-MOVED = 0.01
-"""Distance from its first place [m] from which on an object has moved, so points on it count."""
 
 
 @dataclass(frozen=True)
@@ -142,17 +147,20 @@ def read_truth(
     visible = _find_visible(objects, rgb, states.robot_mask)
     surfaces = outcome = None
     if WITH_SURFACES & set(compared):
-        surfaces = _find_surfaces(folder, frames, cache) or Surfaces(
+        surfaces = _find_surfaces(folder, states, frames, cache) or Surfaces(
             Points(states.keypoints[:frames], states.keypoint_visible[:frames]),
             _of_moving(states.object_pose[..., :3], Points(objects, visible), frames),
             body_id=None,
             known=False,
         )
-    if surfaces is not None and surfaces.resting is not None and {"outcome", "variants"} & set(compared):
+    if surfaces is not None and surfaces.resting is not None and OF_OUTCOME & set(compared):
         points = surfaces.objects, surfaces.resting
         body, local = (np.concatenate([getattr(some, name) for some in points]) for name in ("body", "local"))
         names = [surfaces.names[number] for number in body]
-        outcome = know_outcome(folder, record, states, names, local, "variants" in compared)
+        outcome = know_outcome(record, states, names, local)
+        if outcome is not None and OF_VARIANTS & set(compared):
+            variants, own = find_variants(folder, record, frames, cache)
+            outcome = replace(outcome, variants=variants, own=own)
     return Truth(
         rgb=rgb[:frames],
         mask=states.robot_mask[:frames],
@@ -165,11 +173,11 @@ def read_truth(
     )
 
 
-def _find_surfaces(folder: Path, frames: int, cache: Path | None) -> Surfaces | None:
+def _find_surfaces(folder: Path, states: States, frames: int, cache: Path | None) -> Surfaces | None:
     # Only here: the metrics load without Warp.
     from xew.sim_warp.production.surfaces import find_fingers, read_surfaces
 
-    tracks = read_surfaces(folder, keep=cache)
+    tracks = read_surfaces(folder, cache, states)
     if tracks is None:
         return None
     finger = find_fingers(folder, tracks.names)

@@ -20,7 +20,7 @@ from xew.statistics.correlation import every_draw, exact_p, interval_of_r, parti
 from xew.statistics.inference import DRAWS, LEVEL, SIGNIFICANCE, Component, Drawn, holm
 from xew.statistics.means import MIN_SCENES, Mean, Part, combine, fixed_mean, pool_runs
 from xew.statistics.power import describe_power, find_power
-from xew.statistics.ranking import mean_max_rank_violation, policy_ranking, rank_policies
+from xew.statistics.ranking import mean_max_rank_violation, policy_outcomes, policy_ranking, rank_policies
 from xew.statistics.runs import ASSUMED_SPREAD, RunSpread, find_spread
 from xew.statistics.suites import describe_parting, find_parting, strict_metrics
 from xew.statistics.summary import Summary, measure_power, summarize
@@ -73,6 +73,7 @@ __all__ = [
     "partial_r",
     "pearson",
     "permutation_p",
+    "policy_outcomes",
     "policy_ranking",
     "pool_runs",
     "rank_policies",

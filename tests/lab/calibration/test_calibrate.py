@@ -30,6 +30,7 @@ from xew.episode import Record, read_pixels, read_record, read_states, read_vide
 from xew.metrics import METRICS
 from xew.metrics.grading.codecs import ModelCodec
 from xew.metrics.truth import NEEDS, read_truth
+from xew.protocol import join_fault
 
 
 @pytest.fixture(scope="module")
@@ -220,6 +221,16 @@ def test_calibration_reads_validation_seeds_and_no_test_seed_unless_it_is_named(
     assert chosen(0, 1_000_000, seeds=(1_000_000,)) == {1_000_000}
     with pytest.raises(ConfigError, match=r"test seeds alone.*--validation-seeds 4"):
         chosen(1_000_000)
+
+
+def test_the_first_episodes_are_of_many_tasks_and_robots() -> None:
+    seeds = (0, 1, join_fault(3, 0), join_fault(5, 1))
+    cells = [(task, seed, robot) for task in ("a", "b", "c") for seed in seeds for robot in ("x", "y")]
+    episodes = [(Path("/".join(map(str, cell))), Record(*cell, success=True)) for cell in cells]
+    first = [(record.task, record.robot, record.seed) for _, record in choose(episodes, Args(episodes=6))]
+    assert first[:3] == [("a", "x", 0), ("b", "y", join_fault(3, 0)), ("c", "x", 0)]
+    assert {pair[:2] for pair in first} == {(task, robot) for task in "abc" for robot in "xy"}
+    assert len(choose(episodes, Args())) == len(cells)
 
 
 def test_the_command_loads_neither_simulation_nor_model() -> None:

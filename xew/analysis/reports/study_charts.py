@@ -19,11 +19,14 @@ from xew.analysis.tables.builder import Builder, interval_ends
 from xew.analysis.tables.distances import AXIS_TITLES, Distances, unseen_gaps
 from xew.analysis.tables.labels import ACTIONS, LADDER, REMEDIES, ROBOT_TITLES, SHORT_ROBOTS
 from xew.analysis.tables.table import metric_title
-from xew.protocol import BASELINES, FORGETTING_ROBOT, HELD_OUT_ROBOTS, PASTED_RENDER, ROBOT_NAMES, SHOTS
-from xew.statistics import Mean
+from xew.protocol import BASELINES, FORGETTING_ROBOT, HELD_OUT_ROBOTS, PASTED_RENDER, ROBOT_NAMES, SHOTS, TASK_GROUPS
+from xew.statistics import Mean, policy_outcomes
 
 BAR_METRICS = ("lpips", "region_lpips", "mask_iou", "pck")
 CURVE_METRIC = "lpips"
+OTHER_TASKS = "other tasks"
+RATES, RATES_HEIGHT = (-0.04, 1.04), 3.2
+"""Ends of axes of success rates, and height of a panel with two of them [inches]."""
 MEAN_DISTANCE = "mean distance to the other four"
 DASHES: Mapping[str, Literal["--", "-.", ":"]] = {COPY: "--", PASTED_RENDER: "-.", TRUTH: ":"}
 ROBOT_COLORS = dict(zip(HELD_OUT_ROBOTS, SERIES, strict=False))
@@ -241,6 +244,37 @@ def run_chart(curves: pd.DataFrame, metrics: Sequence[MetricInfo], robots: Seque
     titles = {metric.name: metric_title(metric) for metric in metrics}
     chart = _chart_by_frame("curves", caption, shown, styles, titles, robots)
     return replace(chart, columns=len(robots))
+
+
+def ranking_chart(rows: pd.DataFrame, groups: Mapping[str, Sequence[str]]) -> Chart:
+    """Judged against true success rates of policies, a point for each policy and group of tasks; baselines are left out.
+
+    Args:
+        rows: of a score table.
+        groups: robots that are pooled in a panel, by its title.
+    """
+    outcomes = policy_outcomes(rows[~rows["model"].isin(BASELINES)])
+    group_of = {task: group for group, tasks in TASK_GROUPS.items() for task in tasks}
+    outcomes = outcomes.assign(tasks=[group_of.get(task, OTHER_TASKS) for task in outcomes["task"]])
+    pooled = pd.concat([outcomes[outcomes["robot"].isin(own)].assign(robots=title) for title, own in groups.items()])
+    by_policy = pooled.groupby(["robots", "model", "condition", "tasks", "policy"], sort=False)
+    data = by_policy.agg(true=("true", "mean"), judged=("judged", "mean"), episodes=("true", "size")).reset_index()
+    colors = charts.color_of([*TASK_GROUPS, OTHER_TASKS])
+
+    def draw(axes: Axes, points: pd.DataFrame) -> None:
+        axes.plot([0, 1], [0, 1], color=SOFT, linewidth=0.8)
+        for tasks, own in points.groupby("tasks", sort=False):
+            axes.scatter(own["true"], own["judged"], s=24, facecolors="none", edgecolors=colors[str(tasks)])
+        axes.set(xlim=RATES, ylim=RATES, xlabel="success rate in the simulator", ylabel="judged in predicted video")
+
+    several = len(data[["model", "condition"]].drop_duplicates()) > 1
+    panels = [
+        Panel(" · ".join(map(str, names if several else names[:1])), partial(draw, points=points), RATES_HEIGHT)
+        for names, points in data.groupby(["robots", "model", "condition"], sort=False)
+    ]
+    legend = [Series(tasks, color, "o") for tasks, color in colors.items() if (data["tasks"] == tasks).any()]
+    caption = "A point is the expert or a fault, in one group of tasks. On the line, the judged rate is the true one."
+    return Chart("policies", caption, panels, data, legend, columns=len(groups))
 
 
 def _chart_by_frame(

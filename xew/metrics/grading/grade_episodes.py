@@ -5,7 +5,7 @@ processes.
 import itertools
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import cv2
@@ -20,7 +20,7 @@ from xew.metrics.grading.codecs import ModelCodec
 from xew.metrics.grading.list_jobs import Job
 from xew.metrics.grading.settings import Args, GradingSettings
 from xew.metrics.truth import Truth, read_truth
-from xew.protocol import CODEC_TRUTH, GROUND_TRUTH
+from xew.protocol import CODEC_TRUTH, GROUND_TRUTH, split_fault
 from xew.rollout import Rollout, RolloutError, read_rollout_video, resize_frame
 
 SOFTNESS = 0.8
@@ -40,19 +40,19 @@ FEWEST_OF_PART = 4
 """Number of videos for which an episode is worth being read again."""
 
 Group = list[tuple[Job, tuple[str, ...]]]
-"""Jobs of one episode, each with the names of the metrics that are still to be graded."""
+"""Jobs of one scene and robot, those of an episode together, each with the names of the metrics that are still to be graded."""
 
 
-@dataclass(frozen=True)
+@dataclass
 class GroupResult:
     """What came of grading a group, besides the scores in the store."""
 
-    episode: Path
-    errors: Sequence[str]
-    notes: Sequence[tuple[str, Path]]
+    episodes: list[Path] = field(default_factory=list)
+    errors: list[str] = field(default_factory=list)
+    notes: list[tuple[str, Path]] = field(default_factory=list)
     """Remarks on graded videos, each with the video's file."""
-    has_shapes: bool
-    """Whether the shapes of the episode's bodies were known where they were needed."""
+    without_shapes: list[Path] = field(default_factory=list)
+    """The episodes whose bodies have unknown shapes, where these were needed."""
 
 
 class ThreadResources(threading.local):
@@ -75,29 +75,36 @@ class Grader:
     """Called after each video."""
 
     def __call__(self, group: Group) -> GroupResult:
-        """Grade jobs of one episode, which is read once, and enter the scores.
+        """Grade jobs of one scene and robot, each episode of which is read once, and enter the scores.
 
         Raises:
             RolloutError: a video cannot be graded, unless the settings say to keep going.
         """
-        errors: list[str] = []
-        notes: list[tuple[str, Path]] = []
+        result = GroupResult()
+        for _, jobs in itertools.groupby(group, key=lambda pair: pair[0].episode):
+            self._grade_episode(list(jobs), result)
+        return result
+
+    def _grade_episode(self, group: Group, result: GroupResult) -> None:
+        """Grade jobs of one episode, enter the scores, and add to the result."""
         episode: EpisodeCache | None = None
         for job, metrics in group:
             if self.stop.is_set():
                 break
             try:
                 episode = episode or self.read_episode(group)
-                self.settings.store.write(job.cell, self.grade(job, episode, metrics, notes))
+                self.settings.store.write(job.cell, self.grade(job, episode, metrics, result.notes))
             except (EpisodeError, ValueError) as error:
                 message = str(error) if str(job.folder) in str(error) else f"{job.folder}: {error}"
                 if not self.settings.args.keep_going:
                     raise RolloutError(message) from error
-                errors.append(message)
+                result.errors.append(message)
             self.done()
         surfaces = episode.truth.surfaces if episode else None
         on_surfaces = any(input_kind(name) in (*ON_SURFACES, *JUDGED) for _, names in group for name in names)
-        return GroupResult(group[0][0].episode, errors, notes, has_shapes=not on_surfaces or surfaces is None or surfaces.known)
+        result.episodes.append(group[0][0].episode)
+        if on_surfaces and surfaces is not None and not surfaces.known:
+            result.without_shapes.append(group[0][0].episode)
 
     def read_episode(self, group: Group) -> EpisodeCache:
         """The episode of a group's jobs, as far as their metrics need it. Raises EpisodeError as `read_truth`."""
@@ -231,14 +238,23 @@ def soften_truth(job: Job, truth: Truth) -> np.ndarray | None:
 
 
 def group_jobs(settings: GradingSettings, jobs: Sequence[Job]) -> list[Group]:
-    """Jobs that are not graded yet, grouped by episode; the largest groups come first, so none starts last."""
+    """Jobs that are not graded yet, grouped by scene and robot; the largest groups come first, so none starts last.
+
+    Jobs of one episode stand together in `jobs`, and do so in their group.
+    """
     overwrite, store = settings.args.overwrite, settings.store
     wanted = [(job, settings.metrics if overwrite else store.missing(job.cell, settings.metrics)) for job in jobs]
     todo = [(job, names) for job, names in wanted if names]
     if len(todo) < len(jobs):
         print(f"{len(jobs) - len(todo)} of {len(jobs)} are graded already in {store.folder}")
-    groups = [list(group) for _, group in itertools.groupby(todo, key=lambda pair: (pair[0].episode, pair[0].cell.frames))]
+    groups = [list(group) for _, group in itertools.groupby(sorted(todo, key=_scene), key=_scene)]
     return sorted(groups, key=lambda group: len(group) * group[0][0].cell.frames, reverse=True)
+
+
+def _scene(pair: tuple[Job, tuple[str, ...]]) -> tuple[str, int, str, int]:
+    """Task, base seed and robot of a job, and its number of frames: what retrieval compares has them in common."""
+    cell = pair[0].cell
+    return cell.task, split_fault(cell.seed)[1], cell.robot, cell.frames
 
 
 def split_groups(groups: Sequence[Group], processes: int) -> list[Group]:
@@ -253,10 +269,12 @@ def describe_results(results: Sequence[GroupResult], total: int) -> str:
     for note, path in (noted_video for result in results for noted_video in result.notes):
         noted.setdefault(note, []).append(path)
     lines = [f"{len(paths)} of {total} videos {note} (such as {min(paths)})" for note, paths in sorted(noted.items())]
-    without_shapes = {result.episode for result in results if not result.has_shapes}
+    episodes, without_shapes = (
+        {episode for result in results for episode in getattr(result, name)} for name in ("episodes", "without_shapes")
+    )
     if without_shapes:
         lines.append(
-            f"the shapes of {len(without_shapes)} of {len({result.episode for result in results})} episodes are not known "
+            f"the shapes of {len(without_shapes)} of {len(episodes)} episodes are not known "
             f"(imported, or of another version of their task, such as {min(without_shapes)}): their strict metrics of points "
             "are of links' and objects' origins"
         )

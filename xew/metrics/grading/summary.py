@@ -120,7 +120,7 @@ def ranking_to_markdown(ranking: pd.DataFrame) -> str:
     lines += ["| robot | model | Pearson's r | Spearman | MMRV | policies | scenes |", "|---|---|---|---|---|---|---|"]
     for (robot, *model), own in ranking.groupby(["robot", "model", "condition"], sort=False):
         cells = [
-            f"{value:.3f}" + ("" if math.isnan(low) else f" [{low:.3f}, {high:.3f}]")
+            ("not defined" if math.isnan(value) else f"{value:.3f}") + ("" if math.isnan(low) else f" [{low:.3f}, {high:.3f}]")
             for value, low, high in own[["value", "low", "high"]].to_numpy(float)
         ]
         counts = own[["policies", "scenes"]].iloc[0]

@@ -3,8 +3,9 @@
     measures.py  outcome accuracy, progress error, counterfactual retrieval
     poses.py     poses of objects from tracked points
     judge.py     what a judge of an episode knows, and progress of estimated poses
+    variants.py  what happens under other commands in a scene
 
 Policy ranking rests on rates alone: `xew.statistics.ranking`.
 """
 
-__all__ = ["judge", "measures", "poses"]
+__all__ = ["judge", "measures", "poses", "variants"]

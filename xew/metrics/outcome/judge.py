@@ -7,17 +7,17 @@ commands had in the simulator; a hand touches what it is near to.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import jax
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from xew.episode import Record, States, data_folder, episode_folder, read_record, read_states
+from xew.episode import Record, States
 from xew.metrics.metric import fill_up
 from xew.metrics.outcome.poses import REACH, Bodies, Hands, Lens, follow_bodies
-from xew.protocol import ARMS, split_fault
+from xew.metrics.outcome.variants import CommandVariants, Variant
+from xew.protocol import ARMS
 
 if TYPE_CHECKING:
     from xew.sim_warp.scene import Hinge, Scene
@@ -53,8 +53,10 @@ class Outcome:
     """[k 3] places of tracked points in the frames of their parts [m]."""
     part: np.ndarray
     """[k] int, the part of each, -1 for none."""
-    variants: tuple[States, ...] = ()
-    """States under all variants of the commands in this scene, these among them; empty if there are no others."""
+    variants: CommandVariants | None = None
+    """All variants of the commands in this scene, these among them; None if there are no others or nobody asks."""
+    own: int = 0
+    """The number of these commands among the variants."""
 
     @property
     def is_judged(self) -> bool:
@@ -114,9 +116,10 @@ class Outcome:
             poses: [t p 4 4] of the parts.
             frames: which of them count; a variant that ends earlier stands still.
         """
+        assert self.variants is not None, "asked for by read_truth"
         own = self._points_at(poses)[frames]
         count = np.arange(len(poses))
-        others = (self._poses_of(variant) for variant in self.variants)
+        others = (self._poses_of(variant) for variant in self.variants.variants)
         there = (self._points_at(other[np.minimum(count, len(other) - 1)])[frames] for other in others)
         return np.array([np.linalg.norm(own - points, axis=-1).mean() for points in there], np.float32)
 
@@ -125,7 +128,7 @@ class Outcome:
         matrix = poses[:, self.part[self.part >= 0]]
         return np.einsum("tkij,kj->tki", matrix[..., :3, :3], self.local[self.part >= 0]) + matrix[..., :3, 3]
 
-    def _poses_of(self, states: States) -> np.ndarray:
+    def _poses_of(self, states: States | Variant) -> np.ndarray:
         """Poses [t p 4 4] of the parts in states of the scene."""
         from xew.sim_warp.geometry.poses import matrix_from_pose
         from xew.sim_warp.rendering.observe import scene_things
@@ -169,22 +172,16 @@ class Outcome:
         return measure_progress(self.task, self.scene, first, now)
 
 
-def know_outcome(
-    folder: Path, record: Record, states: States, body: Sequence[str], local: np.ndarray, with_variants: bool
-) -> Outcome | None:
-    """What a judge knows of an episode.
+def know_outcome(record: Record, states: States, body: Sequence[str], local: np.ndarray) -> Outcome | None:
+    """What a judge knows of an episode, without the variants of its commands.
 
     Args:
-        folder, record, states: of the episode.
+        record, states: of the episode.
         body: [k] names of the bodies that points on its objects lie on.
         local: [k 3] places of these points in the frames of their bodies [m].
-        with_variants: whether states under other variants of the commands are read.
 
     Returns:
         None if its scene is unknown or nothing in it can move.
-
-    Raises:
-        EpisodeError: the states of a variant are damaged.
     """
     from xew.sim_warp.production.surfaces import find_scene
     from xew.sim_warp.tasks import recorded_task
@@ -194,8 +191,7 @@ def know_outcome(
         return None
     part_names = [scene.names[part.index] + " lid" * (part.hinge is not None) for part in _parts(scene)]
     part = np.array([part_names.index(name) if name in part_names else -1 for name in body], int)
-    variants = _read_variants(folder, record, states) if with_variants else ()
-    return Outcome(recorded_task(record.task), scene, states, local, part, variants)
+    return Outcome(recorded_task(record.task), scene, states, local, part)
 
 
 def _parts(scene: "Scene") -> tuple[Part, ...]:
@@ -207,12 +203,3 @@ def _angle(base: np.ndarray, lid: np.ndarray, hinge: "Hinge") -> float:
     """The angle [rad] of a hinge, from the poses [4 4] of its base and its lid."""
     turn = Rotation.from_matrix(base[:3, :3].T @ lid[:3, :3]).as_rotvec()
     return float(turn @ hinge.axis / np.linalg.norm(hinge.axis))
-
-
-def _read_variants(folder: Path, record: Record, states: States) -> tuple[States, ...]:
-    """States of the episodes of all variants of the commands, of this one `states`; none if there is no other."""
-    data, (_, base) = data_folder(folder), split_fault(record.seed)
-    seeds = sorted(int(path.name) for path in folder.parents[1].iterdir() if path.name.isdigit())
-    folders = [episode_folder(data, record.task, seed, record.robot) for seed in seeds if split_fault(seed)[1] == base]
-    kept = [path for path in folders if (path / "episode.json").exists() and read_record(path).is_kept]
-    return tuple(states if path.samefile(folder) else read_states(path) for path in kept) if len(kept) > 1 else ()

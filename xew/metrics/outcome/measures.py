@@ -104,7 +104,8 @@ def retrieval(prediction: Distances, target: Distances) -> Scalar:
 
     Args:
         prediction: [k] distances of the prediction from the truths of k command variants of its scene.
-        target: [k] distances of its own truth from the same truths; the least, 0, says which one is its own.
+        target: [k] distances of its own truth from the same truths, or any numbers of which the least says which one is its
+            own.
 
     Returns:
         Scalar float32; NaN where a distance is.

@@ -53,8 +53,13 @@ def scene_names(scene: Scene) -> tuple[str, ...]:
     return *scene.names, *lids, *(thing.name for thing in scene.clutter)
 
 
-def read_surfaces(folder: Path, keep: Path | None = None) -> SurfaceTracks | None:
-    """Surface tracks of an accepted episode, read from or written to the store `keep`, if given.
+def read_surfaces(folder: Path, keep: Path | None = None, states: States | None = None) -> SurfaceTracks | None:
+    """Surface tracks of an accepted episode.
+
+    Args:
+        folder: of the episode.
+        keep: store that they are read from or written to.
+        states: of the episode, which are read if None.
 
     Returns:
         None if the shapes are unknown: the episode was imported, its task now makes another scene of its seed, its task or
@@ -74,7 +79,7 @@ def read_surfaces(folder: Path, keep: Path | None = None) -> SurfaceTracks | Non
         scene = None
     if scene is None:
         return None
-    states = read_states(folder)
+    states = states or read_states(folder, record)
     if keep is None:
         return _render_surfaces(robot, scene, states)
     path, key = tracks_path(keep, record), tracks_key(robot, record.scene_hash, states)
