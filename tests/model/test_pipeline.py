@@ -1,6 +1,7 @@
 """Latents, training, resuming and rollouts on synthetic data, end to end and tiny."""
 
 import ast
+import functools
 import itertools
 import json
 import os
@@ -26,6 +27,7 @@ from xew.metrics.grading.settings import Args
 from xew.model import latents, rollout, train
 from xew.model.cache.clips import clip_starts
 from xew.model.codecs.contract import decode_to_pictures, encode_pictures
+from xew.model.devices.sharding import MeshSettings, make_mesh, place_batch
 from xew.model.episodes.choice import training_episodes
 from xew.model.experiment import Experiment, load_experiment
 from xew.model.runs.log import RunLog
@@ -280,7 +282,8 @@ def test_threads_parse_no_python(experiment: Experiment, monkeypatch: pytest.Mon
     episodes = training_episodes(read_dataset(experiment.data), experiment.choice)
     source = ClipSource.open(experiment.encoding, experiment.instructions, episodes)
     parsed.clear()
-    batches = iter(make_dataset(source, 2, seed=0))
+    place = functools.partial(place_batch, mesh=make_mesh(MeshSettings()))
+    batches = iter(make_dataset(source, 2, seed=0, place=place))
     for _ in range(3):
         next(batches)
     assert [name for name in parsed if name != threading.main_thread().name] == []
