@@ -84,6 +84,9 @@ class Args:
     """Further overrides of the config, in one string, as --overrides="--model.size tiny"."""
     tasks: tuple[str, ...] = tuple(TASKS)
     robots: tuple[str, ...] = tuple(ROBOTS)
+    """Robots of the training seeds."""
+    test_robots: tuple[str, ...] = ()
+    """Robots of the test seeds; default: the same."""
     train_seeds: int = 4
     test_seeds: int = 4
     generate: str = ""
@@ -198,7 +201,8 @@ class Pipeline:
         data, run, rollouts = (str(self.folder / name) for name in ("data", "run", "rollouts"))
         if step == "generate":
             seeds = ["--train-seeds", str(args.train_seeds), "--test-seeds", str(args.test_seeds), *shlex.split(args.generate)]
-            return ["xew.sim_warp.generate", "--tasks", *args.tasks, "--robots", *args.robots, *seeds, "--out", data]
+            robots = ["--robots", *args.robots, "--test-robots", *(args.test_robots or args.robots)]
+            return ["xew.sim_warp.generate", "--tasks", *args.tasks, *robots, *seeds, "--out", data]
         if step == "latents":
             return ["xew.model.latents", str(args.config), *self._overrides]
         if step == "train":
@@ -222,7 +226,8 @@ class Pipeline:
 
     def _check_data(self) -> tuple[int, str]:
         args = self.args
-        expected = len(args.tasks) * len(args.robots) * (args.train_seeds + args.test_seeds)
+        tested = len(args.test_robots or args.robots) * args.test_seeds
+        expected = len(args.tasks) * (len(args.robots) * args.train_seeds + tested)
         return len(check_episodes(self.folder / "data", expected)), "episodes"
 
     def _check_latents(self) -> tuple[int, str]:
