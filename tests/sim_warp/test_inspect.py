@@ -309,6 +309,10 @@ def test_visibility_is_counted_by_task_and_robot(data: Path, inspect: Inspect) -
     (row,) = [line for line in out.splitlines() if line.startswith(f"| `{TASK}`")]
     assert code == 0 and row == f"| `{TASK}` | 100 / 100 | 100 / 100 | nothing moves |"
     assert "Below the aims" not in out
+    edit_header(episode_folder(data, TASK, 0, SLOW), fault="push:40", progress=0.5)
+    without, with_faults = (inspect(data, "--visibility", *flags)[1] for flags in ((), ("--faults",)))
+    assert "| task | `franka_panda` | seen least |" in without and "omitted: 1 episodes of faulty commands" in without
+    assert with_faults.endswith(out[out.index("Share of frames") :]) and "omitted" not in with_faults
 
 
 def test_shapes_that_are_not_known_cannot_be_counted(data: Path, inspect: Inspect) -> None:
