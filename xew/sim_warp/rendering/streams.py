@@ -131,7 +131,7 @@ def three_shadows(robot: RobotSpec, action: np.ndarray, camera: Camera = HEAD_CA
 
 def _hidden_by(table: float | None) -> dict[str, Any]:
     """Arguments of the renderer for bodies on white behind a table of this height [m], or without one."""
-    return {"ground": table is not None, "stage": Stage(raised=(table or TABLE_TOP) - TABLE_TOP, only_hides=True)}
+    return {"ground": table is not None, "stage": Stage(raised=0.0 if table is None else table - TABLE_TOP, only_hides=True)}
 
 
 def _worlds(commands: Sequence[tuple[RobotSpec, np.ndarray]]) -> list[World]:
