@@ -101,7 +101,7 @@ def write_synthetic_view(root: Path, spec: CameraSpec) -> None:
             states, robot_mask=mask, extrinsics=moved, intrinsics=np.diag([width / WIDTH, height / HEIGHT, 1]) @ INTRINSICS
         )
         videos = [resize(read_pixels(folder, name)) for name in ("rgb", "robot")]
-        write_episode(root / VIEWS / spec.view, replace(record, camera=spec), seen, *videos)
+        write_episode(root / VIEWS / spec.view, replace(record, camera=spec, table=0.74), seen, *videos)
 
 
 def sample_scene(task: str, seed: int, frames: int) -> Scene:

@@ -227,6 +227,11 @@ def view_episode(folder: Path, view: str) -> Path:
     return seen
 
 
+def is_stale(record: Record) -> bool:
+    """Whether an episode is of a view that an earlier version rendered, without the table that hides the robot."""
+    return record.camera.name != HEAD and record.table is None
+
+
 def list_views(data: Path) -> list[str]:
     """Names of a data set's views besides `head`, sorted."""
     return sorted(folder.name for folder in Path(data, VIEWS).glob("[!.]*") if folder.is_dir())

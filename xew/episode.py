@@ -80,7 +80,7 @@ FORMS = {
 """Type and shape of each array of `States`."""
 MOVING_FORMS = FORMS | {"extrinsics": "float64 t 4 4"}
 """The same of a camera that moves."""
-NEW_FIELDS = ("camera", "change", "fault", "progress")
+NEW_FIELDS = ("camera", "change", "fault", "progress", "table")
 """Fields of a header that are written only if they are not their default: headers without them keep their bytes."""
 
 
@@ -162,6 +162,8 @@ class Record:
     """The commands' fault, such as grasp_offset:20; empty for the expert. A faulty episode has a failure only if refused."""
     progress: float | None = None
     """The task's progress at the end, from 0 to 1, of a kept faulty episode."""
+    table: float | None = None
+    """Height of the table [m] that hides parts of the robot in robot.mkv; None for the head camera, where nothing does."""
 
     @property
     def is_kept(self) -> bool:
@@ -340,8 +342,9 @@ def _check_record(record: Record) -> Record:
         raise ValueError(f"its motion is {record.motion!r}, expected {' or '.join(MOTIONS)}")
     if record.change != (change := str(parse_change(record.change) or "")):
         raise ValueError(f"its change is {record.change!r}, expected {change!r}")
-    if record.progress is not None and not 0 <= record.progress <= 1:
-        raise ValueError(f"its progress is {record.progress}, expected a number from 0 to 1")
+    for name, most in (("progress", 1), ("table", 2)):
+        if not 0 <= (getattr(record, name) or 0) <= most:
+            raise ValueError(f"its {name} is {getattr(record, name)}, expected a number from 0 to {most}")
     if not SLOWEST <= record.frame_rate <= FASTEST or record.frame_count < 0:
         raise ValueError(f"it has {record.frame_count} frames at {record.frame_rate} a second")
     return record
@@ -459,9 +462,8 @@ def project(points: np.ndarray, intrinsics: np.ndarray, extrinsics: np.ndarray) 
     offset = extrinsics[:3, 3] if extrinsics.ndim == 2 else extrinsics[:, None, :3, 3]
     in_camera = points @ extrinsics[..., :3, :3].swapaxes(-1, -2) + offset
     depth = in_camera[..., 2]
-    focal = intrinsics[[0, 1], [0, 1]]
     front = np.where(depth > 0, depth, np.nan)
-    return focal * in_camera[..., :2] / front[..., None] + intrinsics[:2, 2], depth
+    return intrinsics[[0, 1], [0, 1]] * in_camera[..., :2] / front[..., None] + intrinsics[:2, 2], depth
 
 
 def read_npz(path: Path | LoadedFile) -> dict[str, np.ndarray]:
@@ -590,9 +592,7 @@ def verify_episode(folder: Path) -> Record:
     decoded = replace(record, files={})  # so the content is compared, not the files that hold it
     for name in record.hashes:
         if name not in ("states", "rgb", "robot"):
-            raise EpisodeError(
-                f"{folder} names a hash of {name!r}, expected states, rgb, robot; delete it and run generate again."
-            )
+            raise EpisodeError(f"{folder} names a hash of {name!r}, expected states, rgb, robot; delete and generate it again.")
         if name == "states":
             read_states(folder, decoded)
         elif record.videos:

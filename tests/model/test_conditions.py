@@ -50,7 +50,8 @@ def episode(tmp_path: Path) -> Path:
 def test_a_command_holds_nothing_measured() -> None:
     """`rendered` is the video at `render_path`, at hand or rendered anew from the commands (pixels.py); of the scene there is
     the first frame, whether its video is at hand or not."""
-    named = {"robot", "action", "intrinsics", "extrinsics", "render_path", "rendered", "data", "read_first", "size", "parts"}
+    named = {"robot", "action", "intrinsics", "extrinsics", "render_path", "rendered", "data", "read_first", "size", "table"}
+    named |= {"parts"}
     assert {field.name for field in fields(Command)} == named
 
 

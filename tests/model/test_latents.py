@@ -3,6 +3,7 @@
 import json
 import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,7 @@ from xew.model.conditions import Command
 from xew.model.devices import parts
 from xew.model.experiment import load_experiment
 from xew.model.video.pixels import stored_pixels
+from xew.protocol import CameraSpec
 
 CONFIG = """
 clip: {frames: 9, height: 64, width: 80}
@@ -184,6 +186,14 @@ def test_latents_of_another_shape_are_refused(change: Any, simulated: Path, tmp_
     save_file({"clips": np.array(change(load_file(path)["clips"]))}, path)
     with pytest.raises(ConfigError, match=r"is damaged \(its shape is .*, expected .*; delete it and"):
         cache.read(record, "rgb", 0)
+
+
+def test_latents_of_a_view_depend_on_the_table_before_its_robot(simulated: Path) -> None:
+    cache = open_cache(load_experiment(simulated / "config.yaml").encoding)
+    head = find_accepted(simulated / "data")[0][1]
+    side, raised = (replace(head, camera=CameraSpec("side"), table=table) for table in (None, 0.75))
+    paths = {name: {cache.path(record, name) for record in (head, side, raised)} for name in cache.streams}
+    assert {name: len(of_name) for name, of_name in paths.items()} == {"rgb": 1, "action": 3, "embodiment": 3}
 
 
 def test_a_description_of_the_robot_has_a_length_of_its_own(simulated: Path, tmp_path: Path) -> None:

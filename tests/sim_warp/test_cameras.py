@@ -5,18 +5,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.ndimage import maximum_filter, minimum_filter
 
 from xew.config import ConfigError
 from xew.episode import project
-from xew.protocol import CameraSpec
+from xew.protocol import HEAD, CameraSpec
 from xew.sim_warp.cameras import CAMERAS, demand_sight, fix_camera, get_camera, parse_size, place_camera
 from xew.sim_warp.geometry.camera import HEAD_CAMERA
 from xew.sim_warp.geometry.poses import matrix_from_pose
 from xew.sim_warp.kinematics.forward import tool_poses
 from xew.sim_warp.rendering.bodies import body_names, robot_bodies, robot_pose
+from xew.sim_warp.rendering.observe import Recording, observe
 from xew.sim_warp.rendering.render import Renderer
-from xew.sim_warp.rendering.streams import articulation_action, home_action
+from xew.sim_warp.rendering.streams import articulation_action, command_streams, home_action
 from xew.sim_warp.robots import ROBOTS, RobotSpec, get_robot
+from xew.sim_warp.stage import TABLE_TOP, Stage
 
 WRISTS = ("wrist_left", "wrist_right")
 
@@ -117,6 +120,31 @@ def test_seen_from_the_wrist_its_own_hand_does_not_flow(renderer: Renderer) -> N
     assert fingers.any((1, 2)).all()
     assert np.abs(frames.optical_flow[fingers]).max() < 0.01
     assert np.abs(frames.optical_flow[frames.robot_mask & ~fingers]).max() > 1
+
+
+@pytest.mark.parametrize("name", [name for name in CAMERAS if name != HEAD])
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_the_table_hides_the_commanded_robot_and_is_not_drawn(robot: str, name: str, renderer: Renderer) -> None:
+    spec, action, raised = ROBOTS[robot], articulation_action(ROBOTS[robot])[1:4], -0.03
+    camera = place_camera(fix_camera(get_camera(name, "160x120"), spec), spec, action)
+    alone, hidden = (command_streams(spec, action, camera, table) for table in (None, TABLE_TOP + raised))
+    seen = observe(renderer, [Recording(spec, action)], camera, Stage(raised=raised))[0].robot_mask
+    np.testing.assert_array_equal(hidden.mask, seen)
+    np.testing.assert_array_equal(hidden.optical_flow, np.where(seen[..., None], alone.optical_flow, 0))
+    assert seen.any() and (hidden.render[~maximum_filter(seen, (0, 3, 3))] == 255).all()
+    within = minimum_filter(seen, (0, 3, 3))
+    np.testing.assert_array_equal(hidden.render[within], alone.render[within])
+    assert robot != "aloha_agilex" or (alone.mask & ~seen).any(), "its stand"
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_no_table_hides_the_robot_from_the_head_camera(robot: str, renderer: Renderer) -> None:
+    spec, action = ROBOTS[robot], articulation_action(ROBOTS[robot])[1:4]
+    alone = renderer.render(robot_bodies(spec), robot_pose(spec, action), ground=False, optical_flow=True)
+    streams = command_streams(spec, action)
+    np.testing.assert_array_equal(streams.render, alone.rgb)
+    np.testing.assert_array_equal(streams.mask, alone.robot_mask)
+    np.testing.assert_array_equal(streams.optical_flow, alone.optical_flow)
 
 
 def test_a_camera_needs_a_pose_for_each_frame(renderer: Renderer) -> None:

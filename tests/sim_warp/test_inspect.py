@@ -15,7 +15,7 @@ import pytest
 from tests.sim_warp.small import SLOW, TASK, WITH_SLOW, produce
 from xew.config import ConfigError
 from xew.dataset import VIEWS, list_views, view_episode
-from xew.episode import States, episode_folder, read_record, read_states, read_video, write_episode
+from xew.episode import EpisodeError, States, episode_folder, read_record, read_states, read_video, write_episode
 from xew.model.episodes.commands import episode_command
 from xew.names import folder_name
 from xew.sim_warp.cameras import place_camera
@@ -37,6 +37,7 @@ from xew.sim_warp.production.cells import Job
 from xew.sim_warp.production.surfaces import Seen, Visibility, count_visible, read_surfaces
 from xew.sim_warp.rendering.render import Renderer
 from xew.sim_warp.robots import get_robot
+from xew.sim_warp.stage import TABLE_TOP
 
 ROBOTS = ("franka_panda", SLOW)
 Inspect = Callable[..., tuple[int, str, str]]
@@ -113,14 +114,15 @@ def test_views_are_added_and_the_head_camera_s_episodes_keep_their_bytes(data: P
     code, out, _ = inspect(data, "--render", "--cameras", "head", "wrist_left", "--size", "160x120")
     assert code == 0 and "view head_160x120: 2 of 2 episodes new\nview wrist_left_160x120: 2 of 2 episodes new" in out
     assert tree_bytes(data) == before
-    assert b"camera" not in before[f"{folder_name(TASK)}/0000000/franka_panda/episode.json"]
+    header = before[f"{folder_name(TASK)}/0000000/franka_panda/episode.json"]
+    assert b"camera" not in header and b"table" not in header
     assert list_views(data) == ["head_160x120", "wrist_left_160x120"]
     assert "view head_160x120: 0 of 2 episodes new" in inspect(data, "--render", "--cameras", "head", "--size", "160x120")[1]
     out = inspect(data, "--verify", "--rerender", 6)[1]
     assert "6 of 6 episodes agree with their hashes" in out and "6 episodes rendered again" in out
     folder = view_episode(episode_folder(data, TASK, 0, "franka_panda"), "wrist_left_160x120")
     record, states = read_record(folder), read_states(folder)
-    assert record.camera.fixed_to == "left_tool" and record.camera.position[2] > 0.07
+    assert record.camera.fixed_to == "left_tool" and record.camera.position[2] > 0.07 and record.table == TABLE_TOP
     assert states.extrinsics.shape == (12, 4, 4) and states.robot_mask.shape == (12, 120, 160)
     assert read_video(folder / "rgb.mkv").shape == read_video(folder / "robot.mkv").shape == (12, 120, 160, 3)
     assert states.robot_mask.any((1, 2)).all()
@@ -152,6 +154,24 @@ def test_conditions_of_a_view_are_drawn_for_its_commanded_camera(data: Path, ins
         _ = on_hand.carried_scene
     out = inspect(data, "--verify", "--rerender", 9)[1]
     assert "8 of 8 episodes agree" in out and "6 episodes rendered again" in out
+
+
+def test_a_view_of_an_earlier_version_without_a_table_is_rendered_again(data: Path, inspect: Inspect) -> None:
+    views = ("side_160x120", "head_160x120")
+    add_views = ("--render", "--cameras", "side", "head", "--size", "160x120", "--tile", *views)
+    inspect(data, *add_views)
+    base = episode_folder(data, TASK, 0, "franka_panda")
+    side, head, tiled = (view_episode(base, view) for view in (*views, "+".join(views)))
+    kept = {folder: read_record(folder) for folder in (side, head, tiled)}
+    for folder in (side, tiled):
+        edit_header(folder, table=None)
+        with pytest.raises(EpisodeError, match="no table hides the robot; run `inspect DATA --render --cameras …`"):
+            episode_command(folder, read_record(folder))
+    assert episode_command(head, read_record(head)).table is None
+    out = inspect(data, *add_views)[1]
+    for view, new in ((views[0], 1), (views[1], 0), ("+".join(views), 1)):
+        assert f"view {view}: {new} of 2 episodes new" in out
+    assert {folder: read_record(folder) for folder in kept} == kept
 
 
 def test_a_damaged_view_is_named(data: Path, inspect: Inspect) -> None:
@@ -289,6 +309,10 @@ def test_visibility_is_counted_by_task_and_robot(data: Path, inspect: Inspect) -
     (row,) = [line for line in out.splitlines() if line.startswith(f"| `{TASK}`")]
     assert code == 0 and row == f"| `{TASK}` | 100 / 100 | 100 / 100 | nothing moves |"
     assert "Below the aims" not in out
+    edit_header(episode_folder(data, TASK, 0, SLOW), fault="push:40", progress=0.5)
+    without, with_faults = (inspect(data, "--visibility", *flags)[1] for flags in ((), ("--faults",)))
+    assert "| task | `franka_panda` | seen least |" in without and "omitted: 1 episodes of faulty commands" in without
+    assert with_faults.endswith(out[out.index("Share of frames") :]) and "omitted" not in with_faults
 
 
 def test_shapes_that_are_not_known_cannot_be_counted(data: Path, inspect: Inspect) -> None:

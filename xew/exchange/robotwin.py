@@ -24,7 +24,7 @@ from tqdm import tqdm
 
 import xew
 from xew.config import ConfigError, user_errors
-from xew.dataset import VIEWS
+from xew.dataset import VIEWS, is_stale
 from xew.episode import (
     EpisodeError,
     Record,
@@ -52,6 +52,7 @@ from xew.sim_warp.rendering.observe import keypoint_names, keypoint_positions
 from xew.sim_warp.rendering.streams import command_renders
 from xew.sim_warp.robots import RobotSpec, get_robot, is_path, keep_robot
 from xew.sim_warp.robots.user.draft import find_description, read_draft
+from xew.sim_warp.stage import TABLE_TOP
 
 EMBODIMENTS = {
     "aloha-agilex": "aloha_agilex",
@@ -153,7 +154,8 @@ def _write_views(folder: Path, record: Record, robot: RobotSpec | None, recorded
     for name, seen in recorded.cameras.items():
         root = path_below(data_folder(folder), VIEWS, name)
         moves = f"{name.removeprefix('wrist_')}_tool" in TOOLS
-        if (episode_folder(root, record.task, record.seed, record.robot) / "episode.json").is_file() or (moves and not robot):
+        stored = episode_folder(root, record.task, record.seed, record.robot)
+        if ((stored / "episode.json").is_file() and not is_stale(read_record(stored))) or (moves and not robot):
             continue
         spec = _locate_camera(name, seen, robot, states.action)
         camera = Camera(seen.intrinsics, seen.extrinsics if moves else seen.extrinsics[0])
@@ -161,8 +163,8 @@ def _write_views(folder: Path, record: Record, robot: RobotSpec | None, recorded
         if robot is not None:
             keypoints, _ = project(camera, keypoint_positions(robot, states.action))
             of_view = replace(of_view, keypoints=keypoints.astype(np.float32))
-            video = command_renders([(robot, states.action)], commanded_camera(spec, robot, of_view))[0]
-        write_episode(root, replace(record, camera=spec), of_view, seen.rgb, video)
+            video = command_renders([(robot, states.action)], commanded_camera(spec, robot, of_view), TABLE_TOP)[0]
+        write_episode(root, replace(record, camera=spec, table=TABLE_TOP), of_view, seen.rgb, video)
 
 
 def _locate_camera(name: str, seen: OtherCamera, robot: RobotSpec | None, action: np.ndarray) -> CameraSpec:

@@ -22,7 +22,7 @@ from jaxtyping import Float, Float32, Shaped, UInt8
 from scipy.spatial.transform import Rotation
 
 from xew.config import ConfigError
-from xew.dataset import view_episode
+from xew.dataset import is_stale, view_episode
 from xew.episode import EpisodeError, Record, States, data_folder, read_pixels, read_record, read_states
 from xew.model.video.frames import TEMPORAL_FACTOR
 from xew.protocol import ARMS, CAMERA_SIZE
@@ -58,6 +58,8 @@ class Command:
     """Function that reads the first frame of the scene [1 h w 3] uint8."""
     size: tuple[int, int] = CAMERA_SIZE
     """Width and height of the camera's picture [pixels]."""
+    table: float | None = None
+    """Height of the table [m] that hides what lies behind it, as of `Record.table`."""
     parts: tuple["Command", ...] = ()
     """The same commands in each view of a tiled picture, from top to bottom."""
 
@@ -76,7 +78,7 @@ class Command:
             return CommandStreams(
                 self.render, *(np.concatenate([getattr(part.streams, name) for part in self.parts], axis=1) for name in names)
             )
-        return command_streams(self.robot_spec, self.action, self.camera, colors=False)
+        return command_streams(self.robot_spec, self.action, self.camera, self.table, colors=False)
 
     @cached_property
     def shadows(self) -> Video:
@@ -208,13 +210,24 @@ def make_command(
     rendered: Video | None = None,
     scene: UInt8[np.ndarray, "n h w 3"] | None = None,
 ) -> Command:
-    """The command of an episode; videos [t h w 3] and [n h w 3] as in `episodes.commands.episode_command`."""
+    """The command of an episode; videos [t h w 3] and [n h w 3] as in `episodes.commands.episode_command`.
+
+    Raises:
+        EpisodeError: the episode is of a view that was rendered when no table hid the robot.
+    """
     render, data = folder / "robot.mkv", data_folder(folder)
+    if is_stale(record):
+        raise EpisodeError(
+            f"{folder} was rendered by an earlier xew, where no table hides the robot; run `inspect DATA --render --cameras …` "
+            "(with --tile for a tiled view) or the import again."
+        )
     first = partial(read_pixels, folder, "rgb", most=1, record=record) if scene is None else partial(np.copy, scene[:1])
     extrinsics = _move_camera(record, states, data) if record.camera.moves else states.extrinsics
     size = states.robot_mask.shape[2], states.robot_mask.shape[1]
     parts = tuple(_part_command(view_episode(folder, part)) for part in record.camera.parts)
-    return Command(record.robot, states.action, states.intrinsics, extrinsics, render, rendered, data, first, size, parts)
+    return Command(
+        record.robot, states.action, states.intrinsics, extrinsics, render, rendered, data, first, size, record.table, parts
+    )
 
 
 def _part_command(folder: Path) -> Command:

@@ -170,7 +170,7 @@ def demand_sight(specs: Sequence[CameraSpec], robots: Sequence[RobotSpec]) -> No
         for robot in robots:
             fixed, motion = fix_camera(spec, robot), np.concatenate([home_action(robot)[None], articulation_action(robot)])
             worlds = robot_bodies(robot), robot_pose(robot, motion)
-            frames = default_renderer().render(*worlds, place_camera(fixed, robot, motion), ground=False)
+            frames = default_renderer().render(*worlds, place_camera(fixed, robot, motion))
             if not frames.robot_mask.any():
                 raise ConfigError(
                     f"the camera {spec.name} at {fixed.position} in the frame of {spec.fixed_to} sees nothing of {robot.key}; "

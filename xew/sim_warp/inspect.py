@@ -42,6 +42,8 @@ class Args:
     visibility: bool = False
     """Print in how many frames the camera sees enough surface points of each robot and each moving object. Points that
     `xew.metrics.evaluate` has stored for the data set are not rendered again."""
+    faults: bool = False
+    """With --visibility: also count the episodes of faulty commands, most of which are no demonstrations of success."""
     rerender: int = 0
     """Number of episodes to render again from their states and compare with the recorded hashes."""
     render: bool = False
@@ -100,7 +102,7 @@ def main() -> None:
     if not pictured and (args.visibility or args.rerender or args.render or args.pictures or args.grid or args.page):
         raise EpisodeError(f"no seed under {args.data} is accepted; expected at least one to render or draw.")
     if args.visibility:
-        show_visibility([folder for folder, _ in pictured], args)
+        show_visibility(pictured, args)
     if args.rerender:
         rerender([folder for folder in stored if not read_record(folder).camera.parts], args.rerender)
     if args.render or args.cameras or args.tile:
@@ -149,15 +151,18 @@ def render(cells: list[tuple[Path, Record]], args: Args) -> None:
             tile_views(cells, args.tile)
 
 
-def show_visibility(folders: list[Path], args: Args) -> None:
-    """Print the visibility of robots and moving objects."""
+def show_visibility(cells: list[tuple[Path, Record]], args: Args) -> None:
+    """Print the visibility of robots and moving objects; in faulty episodes only with --faults."""
+    folders = [folder for folder, record in cells if args.faults or not record.fault]
     store = folder_beside(args.data.absolute(), "surfaces")
     visibility = read_visibility(folders, store if store.is_dir() else None)
     if not visibility:
         raise EpisodeError(
-            f"{args.data} has no episode with known shapes: all are imported, or of tasks, scenes or robots that this xew does "
-            "not have."
+            f"{args.data} has no episode with known shapes: all are imported, faulty (see --faults), or of tasks, scenes or "
+            "robots that this xew does not have."
         )
+    if left_out := len(cells) - len(folders):
+        print(f"omitted: {left_out} episodes of faulty commands, which --faults counts too")
     print(visibility_section(visibility))
 
 

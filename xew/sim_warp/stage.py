@@ -89,6 +89,8 @@ class Stage:
     wall: Pattern | None = None
     ground: Pattern | None = None
     """Patterns of the surfaces; None shows their plain colors."""
+    only_hides: bool = False
+    """Whether there is only the table, which hides what lies behind it and is not drawn itself."""
 
 
 STANDARD = Stage()
@@ -111,8 +113,9 @@ def stage_parts(stage: Stage = STANDARD) -> list[tuple[Mesh, Pattern | None]]:
 
 
 def stage_mesh(stage: Stage = STANDARD) -> Mesh:
-    """Table, wall and ground as one mesh in the world frame."""
-    return merge([mesh for mesh, _ in stage_parts(stage)])
+    """Table, wall and ground, or only the table, as one mesh in the world frame."""
+    plate, wall, ground, *legs = (mesh for mesh, _ in stage_parts(stage))
+    return merge([plate, *legs] if stage.only_hides else [plate, wall, ground, *legs])
 
 
 def linear_from_srgb(color: np.ndarray) -> np.ndarray:

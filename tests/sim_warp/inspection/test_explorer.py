@@ -189,7 +189,7 @@ def test_flow_is_a_row_of_the_film(data: Path, tmp_path: Path, monkeypatch: pyte
     class Streams:
         optical_flow = flow
 
-    monkeypatch.setattr(streams, "command_streams", lambda robot, action, camera: asked.append(robot.key) or Streams)
+    monkeypatch.setattr(streams, "command_streams", lambda robot, action, camera, table: asked.append(robot.key) or Streams)
     cells = [(path.parent, read_record(path.parent)) for path in sorted(data.rglob("episode.json"))]
     write_page(Page("t", choose_scenes(cells, (), 6, {})[0], 0, {}), tmp_path / "page")
     assert asked == ["ur5_wsg", "piper"]

@@ -55,7 +55,7 @@ def page(data: Path) -> Path:
     predictions = find_predictions([data / "tree"])
     scenes, _ = choose_scenes([cell for cell in find_records(data) if "tree" not in cell[0].parts], (), 6, {})
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(streams, "command_streams", lambda robot, action, camera: Streams)
+        patch.setattr(streams, "command_streams", lambda robot, action, camera, table: Streams)
         write_page(Page(HOSTILE, scenes, 0, predictions), data / "page")
     return data / "page" / "index.html"
 

@@ -10,6 +10,7 @@ from xew.config import digest
 from xew.dataset import Episode
 from xew.episode import Record, episode_folder
 from xew.model.settings.parts import Encoding
+from xew.protocol import HEAD
 
 CACHE_VERSION = 2
 RUN_SCALES = "scales.json"
@@ -23,6 +24,8 @@ def stream_path(encoding: Encoding, codec_hash: str, record: Record, stream: str
     name = condition.name if condition else stream
     of_scene = condition is None or condition.make is None
     sources = (record.hashes["rgb"],) if of_scene else (record.hashes["states"], record.hashes["robot"])
+    if not of_scene and record.camera.name != HEAD:
+        sources = (*sources, record.table)
     if condition is not None and condition.is_guess:
         sources = (*sources, record.hashes["rgb"])
     if condition is not None and (of_scene or condition.with_history):

@@ -46,7 +46,10 @@ class NewCommand(Command):
         """The robot-only video [t h w 3] uint8."""
         from xew.sim_warp.rendering.streams import command_renders
 
-        return self._fill_up("render", lambda action, camera: (command_renders([(self.robot_spec, action)], camera)[0],))[0]
+        def make(action: np.ndarray, camera: "Camera") -> Pictures:
+            return (command_renders([(self.robot_spec, action)], camera, self.table)[0],)
+
+        return self._fill_up("render", make)[0]
 
     @cached_property
     def streams(self) -> "CommandStreams":
@@ -54,7 +57,7 @@ class NewCommand(Command):
         from xew.sim_warp.rendering.streams import CommandStreams, command_streams
 
         def make(action: np.ndarray, camera: "Camera") -> Pictures:
-            made = command_streams(self.robot_spec, action, camera, colors=False)
+            made = command_streams(self.robot_spec, action, camera, self.table, colors=False)
             return made.mask, made.optical_flow
 
         return CommandStreams(np.empty(0), *self._fill_up("streams", make))

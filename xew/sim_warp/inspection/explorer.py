@@ -241,7 +241,8 @@ def _flow(cell: Episode, states: States) -> np.ndarray:
 
     folder, record = cell
     robot = recorded_robot(record.robot, data_folder(folder))
-    return flow_to_rgb(command_streams(robot, states.action, commanded_camera(record.camera, robot, states)).optical_flow)
+    camera = commanded_camera(record.camera, robot, states)
+    return flow_to_rgb(command_streams(robot, states.action, camera, record.table).optical_flow)
 
 
 def _models(scene: Scene, predictions: Predictions) -> list[tuple[str, list[Rollout | None]]]:

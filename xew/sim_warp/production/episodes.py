@@ -30,7 +30,7 @@ def render_cells(cells: Sequence[Cell], renderer: Renderer) -> list[Pixels]:
     """The camera's observation of each cell of a scene, and the robot alone by its commands [t h w 3] uint8."""
     camera = spec_camera(_camera(cells[0]))
     views = observe(renderer, [cell.recording for cell in cells], camera, stage_of(parse_change(cells[0].change)))
-    renders = command_renders([(cell.robot, cell.commands.action) for cell in cells], camera, renderer)
+    renders = command_renders([(cell.robot, cell.commands.action) for cell in cells], camera, renderer=renderer)
     return list(zip(views, renders, strict=True))
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from xew.dataset import VIEWS, view_episode
+from xew.dataset import VIEWS, is_stale, view_episode
 from xew.episode import (
     EpisodeError,
     Record,
@@ -23,7 +23,7 @@ from xew.episode import (
     write_episode,
 )
 from xew.names import path_below
-from xew.protocol import OWN_MOTION, CameraSpec, parse_change
+from xew.protocol import HEAD, OWN_MOTION, CameraSpec, parse_change
 from xew.sim_warp.cameras import fix_camera, place_camera
 from xew.sim_warp.changes.looks import camera_of, stage_of
 from xew.sim_warp.changes.scenes import change_of, demand_change, make_plan, make_scene
@@ -37,6 +37,7 @@ from xew.sim_warp.rendering.render import Renderer
 from xew.sim_warp.rendering.streams import command_renders
 from xew.sim_warp.robots import recorded_robot
 from xew.sim_warp.scene import Scene, scene_hash
+from xew.sim_warp.stage import TABLE_TOP
 from xew.sim_warp.tasks import recorded_task
 
 
@@ -77,7 +78,8 @@ def _render_view(
     camera = place_camera(header.camera, robot, states.joint_pos)
     recording = scene_recording(robot, scene, states.joint_pos, states.object_pose, states.object_joint)
     view = observe(renderer, [recording], camera, stage_of(parse_change(header.change)))[0]
-    render = command_renders([(robot, states.action)], place_camera(header.camera, robot, states.action), renderer)[0]
+    commanded = place_camera(header.camera, robot, states.action)
+    render = command_renders([(robot, states.action)], commanded, header.table, renderer)[0]
     seen = replace(
         states,
         keypoints=view.keypoints,
@@ -100,24 +102,25 @@ def add_view(folder: Path, spec: CameraSpec, renderer: Renderer) -> bool:
     data = data_folder(folder)
     robot = recorded_robot(record.robot, data)
     demand_known(folder, "joint_pos", "object_pose", record=record)
-    fixed = camera_of(parse_change(record.change), fix_camera(spec, robot))
+    change = parse_change(record.change)
+    table = None if spec.name == HEAD else TABLE_TOP + stage_of(change).raised
+    header = replace(record, camera=camera_of(change, fix_camera(spec, robot)), table=table, device=renderer.device.name)
     states, root = read_states(folder, record), data / VIEWS / spec.view
-    if _shows(episode_folder(root, record.task, record.seed, record.robot), fixed, states):
+    if _shows(episode_folder(root, record.task, record.seed, record.robot), header, states):
         return False
-    header = replace(record, camera=fixed, device=renderer.device.name)
     seen, rgb, render = _render_view(robot, _sample_again(folder, record), states, header, renderer)
     write_episode(path_below(data, VIEWS, spec.view), header, seen, rgb, render)
     return True
 
 
-def _shows(folder: Path, spec: CameraSpec, states: States) -> bool:
-    """Whether a view is of this camera and of these states."""
+def _shows(folder: Path, header: Record, states: States) -> bool:
+    """Whether a view has the camera and table of this header, and is of these states."""
     if not (folder / "episode.json").exists():
         return False
     record = read_record(folder)
     seen = read_states(folder, record)
     same = (np.array_equal(getattr(seen, name), getattr(states, name)) for name in ("action", "joint_pos", "object_pose"))
-    return record.camera == spec and record.videos and all(same)
+    return (record.camera, record.table) == (header.camera, header.table) and record.videos and all(same)
 
 
 def add_tiled(folder: Path, views: Sequence[str]) -> bool:
@@ -136,12 +139,14 @@ def add_tiled(folder: Path, views: Sequence[str]) -> bool:
     first, ((width, height),) = records[0], sizes
     root = path_below(data_folder(folder), VIEWS, "+".join(views))
     camera = replace(first.camera, name="+".join(views), size=(width, height * len(views)))
+    tables = [] if any(map(is_stale, records)) else [record.table for record in records if record.table]
+    header = replace(first, camera=camera, table=tables[0] if tables else None)
     states = [read_states(part) for part in parts]
-    if _shows(episode_folder(root, first.task, first.seed, first.robot), camera, states[0]):
+    if _shows(episode_folder(root, first.task, first.seed, first.robot), header, states[0]):
         return False
     seen = replace(states[0], robot_mask=np.concatenate([of_part.robot_mask for of_part in states], axis=1))
     rgb, robot = (np.concatenate([read_pixels(part, name) for part in parts], axis=1) for name in ("rgb", "robot"))
-    write_episode(root, replace(first, camera=camera), seen, rgb, robot)
+    write_episode(root, header, seen, rgb, robot)
     return True
 
 

@@ -164,7 +164,11 @@ class Passes:
         return images
 
     def light_stage(self, camera: Camera, shown: stage.Stage | None, look: Look) -> shading.LitStage:
-        """A stage with its look in the view of a camera, or in each view of one that moves; empty without a stage."""
+        """A stage with its look in the view of a camera, or in each view of one that moves; empty without a stage.
+
+        A stage that only hides has depth and the sky's color.
+        """
+        is_drawn = shown is not None and not shown.only_hides
         bodies = [] if shown is None else [Body(stage.stage_mesh(shown), False)]
         views = len(camera.extrinsics) if camera.moves else 1
         table, pose = pack_frames([World(bodies, np.tile(IDENTITY, (views, len(bodies), 1)))], [0])
@@ -176,8 +180,9 @@ class Passes:
         )
         chunk = Chunk(self.device, call.geometry, table, camera)
         drawn = self.draw(call, chunk)
-        height, width, lights = camera.height, camera.width, 0 if shown is None else len(shown.lights)
-        lighting = [look.lights, look.shading, drawn.vertex, drawn.key, wp.vec3(*stage.SKY), look.patterns]
+        height, width, lights = camera.height, camera.width, len(look.lights) if is_drawn else 0
+        key = drawn.key if is_drawn else self._zeros(drawn.key.shape, wp.uint64)
+        lighting = [look.lights, look.shading, drawn.vertex, key, wp.vec3(*stage.SKY), look.patterns]
         lit = shading.LitStage()
         lit.key = drawn.key
         lit.ambient = self._zeros((views, height, width), wp.vec3)

@@ -114,6 +114,7 @@ class Renderer:
             camera: of all worlds; one that moves has a pose for each frame of all worlds, in order.
             ground: True for table, wall, ground and shadows; False for the bodies alone on white, without shadows.
             stage: table, wall, ground and lights of all worlds; without the ground the light is the standard one.
+                One that only hides (`Stage.only_hides`) casts no shadows.
             depth, body, optical_flow: requests for the optional images of `Frames`.
             colors: whether to make `rgb`.
 
@@ -157,7 +158,7 @@ class Renderer:
             pose=wp.array(pose, dtype=wp.transform, device=self.device),
             camera=camera,
             look=look,
-            shadows=len(stage.lights) if stage and colors else 0,
+            shadows=len(stage.lights) if stage and colors and not stage.only_hides else 0,
             wanted=wanted,
             colors=colors,
         )

@@ -6,6 +6,7 @@ To add one, write a pure function of (robot, action, camera) here.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
+from typing import Any
 
 import cv2
 import numpy as np
@@ -20,7 +21,7 @@ from xew.sim_warp.geometry.poses import matrix_from_pose
 from xew.sim_warp.kinematics.forward import tool_pose
 from xew.sim_warp.rendering.bodies import robot_bodies, robot_pose
 from xew.sim_warp.rendering.render import FLOW_LIMIT, Body, Renderer, World
-from xew.sim_warp.stage import Light, Stage
+from xew.sim_warp.stage import TABLE_TOP, Light, Stage
 
 VIEW_COUNT = 9
 CLIP_FRAMES = 17
@@ -81,34 +82,42 @@ def default_renderer(frames_per_chunk: int | None = None) -> Renderer:
 _shared: list[Renderer] = []
 
 
-def command_streams(robot: RobotSpec, action: np.ndarray, camera: Camera = HEAD_CAMERA, colors: bool = True) -> CommandStreams:
+def command_streams(
+    robot: RobotSpec, action: np.ndarray, camera: Camera = HEAD_CAMERA, table: float | None = None, colors: bool = True
+) -> CommandStreams:
     """Render [t h w 3] uint8, mask [t h w] and exact optical flow [t h w 2] pixels of canonical commands [t 16].
 
-    Without `colors` the render is empty, which halves the time on a CPU.
+    Args:
+        table: height of the table that hides what lies behind it, as in the header of an episode (`Record.table`).
+        colors: without them the render is empty, which halves the time on a CPU.
 
     Raises:
         ValueError: the action does not have 16 columns.
     """
-    return command_streams_batch([(robot, action)], camera, colors=colors)[0]
+    return command_streams_batch([(robot, action)], camera, table, colors=colors)[0]
 
 
 def command_streams_batch(
     commands: Sequence[tuple[RobotSpec, np.ndarray]],
     camera: Camera = HEAD_CAMERA,
+    table: float | None = None,
     renderer: Renderer | None = None,
     colors: bool = True,
 ) -> list[CommandStreams]:
     """`command_streams` of many (robot, action [t 16]) at once; each does not depend on the others."""
     renderer = renderer or default_renderer()
-    batch = renderer.render_batch(_worlds(commands), camera, ground=False, optical_flow=True, colors=colors)
+    batch = renderer.render_batch(_worlds(commands), camera, **_hidden_by(table), optical_flow=True, colors=colors)
     return [CommandStreams(frames.rgb, frames.robot_mask, frames.optical_flow) for frames in batch]
 
 
 def command_renders(
-    commands: Sequence[tuple[RobotSpec, np.ndarray]], camera: Camera = HEAD_CAMERA, renderer: Renderer | None = None
+    commands: Sequence[tuple[RobotSpec, np.ndarray]],
+    camera: Camera = HEAD_CAMERA,
+    table: float | None = None,
+    renderer: Renderer | None = None,
 ) -> list[np.ndarray]:
     """Only the renders [t h w 3] uint8 of `command_streams_batch`, of which an episode keeps a video."""
-    batch = (renderer or default_renderer()).render_batch(_worlds(commands), camera, ground=False)
+    batch = (renderer or default_renderer()).render_batch(_worlds(commands), camera, **_hidden_by(table))
     return [frames.rgb for frames in batch]
 
 
@@ -118,6 +127,11 @@ def three_shadows(robot: RobotSpec, action: np.ndarray, camera: Camera = HEAD_CA
     The three shadows of a part say where it is above the table, whatever lights the scene.
     """
     return default_renderer().render_batch(_worlds([(robot, action)]), camera, stage=THREE_LAMPS)[0].rgb
+
+
+def _hidden_by(table: float | None) -> dict[str, Any]:
+    """Arguments of the renderer for bodies on white behind a table of this height [m], or without one."""
+    return {"ground": table is not None, "stage": Stage(raised=0.0 if table is None else table - TABLE_TOP, only_hides=True)}
 
 
 def _worlds(commands: Sequence[tuple[RobotSpec, np.ndarray]]) -> list[World]:
