@@ -12,7 +12,7 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 from xew.concurrency import PARSING
-from xew.sim_warp.devices.newton import newton
+from xew.sim_warp.devices.newton import newton, without_adjoints
 from xew.sim_warp.devices.waiting import wait_for
 from xew.sim_warp.embodiment.spec import Arm, RobotSpec
 from xew.sim_warp.embodiment.urdf import load_urdf
@@ -254,9 +254,10 @@ class _Problems:
             newton.ik.IKObjectiveJointLimit(model.joint_limit_lower, model.joint_limit_upper, weight=LIMIT_WEIGHT),
             self.posture,
         ]
-        self.solver = newton.ik.IKSolver(
-            model, size, objectives, jacobian_mode=newton.ik.IKJacobianType.ANALYTIC, lambda_initial=1e-3
-        )
+        with without_adjoints():
+            self.solver = newton.ik.IKSolver(
+                model, size, objectives, jacobian_mode=newton.ik.IKJacobianType.ANALYTIC, lambda_initial=1e-3
+            )
         self.has_run = False
         self.graph: wp.Graph | None = None
 
