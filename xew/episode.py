@@ -500,8 +500,8 @@ def write_video(path: Path, video: np.ndarray, frame_rate: float = FRAME_RATE) -
         stream = container.add_stream("libx264rgb", rate=exact_rate(frame_rate), options={"preset": "ultrafast", "qp": "0"})
         stream.width, stream.height, stream.pix_fmt = width, height, "rgb24"
         stream.codec_context.thread_count = 1  # several episodes are written in parallel
-        for frame in video:
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
+        for frame in np.ascontiguousarray(video):
+            container.mux(stream.encode(av.VideoFrame.from_numpy_buffer(frame, format="rgb24")))
         container.mux(stream.encode())
 
 

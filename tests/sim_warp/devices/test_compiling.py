@@ -11,10 +11,17 @@ import warp as wp
 from lab import compile_kernels as compile_command
 from tests.sim_warp.small import TASK, InlineWorkers, launched_modules, produce
 from xew.sim_warp.devices.kernels import Variant, compile_together, noted_launches
+from xew.sim_warp.kinematics import inverse
 from xew.sim_warp.physics.kernels import set_targets
 from xew.sim_warp.production import warm_up
 from xew.sim_warp.production.cells import Job
 from xew.sim_warp.rendering.render import Renderer
+
+
+@pytest.fixture(autouse=True)
+def _new_solvers() -> None:
+    """Solvers of earlier tests replay graphs instead of launching kernels."""
+    inverse._problems.cache_clear()
 
 
 @wp.kernel(module="unique", enable_backward=False)
@@ -156,3 +163,13 @@ def test_an_architecture_that_warp_does_not_know_is_refused_in_a_line(capsys: py
         compile_command.main(compile_command.Args(arch=13))
     assert left.value.code == 2
     assert "--arch is 13; Warp's compiler knows" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("part", ["physics", "kinematics"])
+def test_newton_s_kernels_have_no_adjoints(part: str) -> None:
+    """Newton imports its solvers at first use, and makes kernels of inverse kinematics then."""
+    with compile_command.watched_launches() as found:
+        warm_up.do_smallest_piece(part, "cpu", 1)
+    modules = [module for module, _ in found]
+    assert any(module.name.startswith(warm_up.PARTS[part]) for module in modules)
+    assert not any(module.options["enable_backward"] for module in modules)

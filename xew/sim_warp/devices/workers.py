@@ -22,7 +22,7 @@ Job = TypeVar("Job")
 Result = TypeVar("Result")
 
 IMPORTED = ("xew.sim_warp.production.preloaded",)
-"""Modules that are imported before workers are forked."""
+"""Modules that workers for all steps of the production need."""
 MEMORY_PER_WORKER = 9e9
 """GPU memory of a worker [bytes]: a batch of 256 worlds, 512 frames in flight and CUDA's own memory."""
 FRAMES_OF_A_RENDERING_WORKER = 192
@@ -90,12 +90,13 @@ class Workers:
     Args:
         count: number of processes.
         devices: their default devices, assigned in turn; default: Warp's choice.
+        imported: modules that are imported before workers are forked.
     """
 
-    def __init__(self, count: int, devices: Sequence[warp.Device] = ()) -> None:
+    def __init__(self, count: int, devices: Sequence[warp.Device] = (), imported: Sequence[str] = IMPORTED) -> None:
         os.environ.setdefault("OMP_NUM_THREADS", "1")  # one core per worker
         self.count = count
-        self._pool = open_processes(count, IMPORTED, _begin_worker, own=[device.alias for device in devices])
+        self._pool = open_processes(count, imported, _begin_worker, own=[device.alias for device in devices])
 
     def __enter__(self) -> "Workers":
         return self

@@ -29,7 +29,7 @@ EPISODES_PER_WORKER = 32
 
 def verify(folders: list[Path]) -> list[str]:
     """Compare all files with their hashes and check motions for plausibility; returns the error messages."""
-    with Workers(min(usable_cores(), len(folders) // EPISODES_PER_WORKER)) as workers:
+    with Workers(min(usable_cores(), len(folders) // EPISODES_PER_WORKER), imported=(__name__,)) as workers:
         several = len(folders) >= 2 * EPISODES_PER_WORKER
         results = workers.run(find_problem, folders) if several else map(find_problem, folders)
         bar = tqdm(results, desc="verifying", unit="episode", total=len(folders))
@@ -85,7 +85,7 @@ def _render_all(render: Callable[[Path], Result], folders: list[Path]) -> list[R
     """Render episodes in worker processes if there are many, else here; returns the results in any order."""
     devices = find_devices(None)
     several = len(folders) >= 2 * EPISODES_PER_WORKER
-    with Workers(worker_count(devices), devices) as workers:
+    with Workers(worker_count(devices), devices, (__name__,)) as workers:
         if several:
             compile_on_devices(workers, {"rendering": devices[0].alias}, 1)
         results = workers.run(render, folders) if several else map(render, folders)

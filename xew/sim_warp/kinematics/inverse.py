@@ -1,7 +1,7 @@
 """Inverse kinematics: batched Levenberg-Marquardt of newton.ik, on the CPU or a GPU.
 
-Every arm has seven joints (six-joint arms get a fixed last one): one set of kernels, and on a GPU one CUDA graph, serves all
-robots. Arms that differ only by their bases are solved together, mirrored arms separately.
+Every arm has seven joints (six-joint arms get a fixed last one): one set of kernels, and one graph of their launches, serves
+all robots. Arms that differ only by their bases are solved together, mirrored arms separately.
 """
 
 from dataclasses import dataclass
@@ -11,7 +11,8 @@ import numpy as np
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from xew.sim_warp.devices.newton import newton
+from xew.concurrency import PARSING
+from xew.sim_warp.devices.newton import newton, without_adjoints
 from xew.sim_warp.devices.waiting import wait_for
 from xew.sim_warp.embodiment.spec import Arm, RobotSpec
 from xew.sim_warp.embodiment.urdf import load_urdf
@@ -233,7 +234,7 @@ def _problems(device: str, joints: int, size: int, iterations: int, posture_weig
 
 
 class _Problems:
-    """A fixed number of problems of one arm, with buffers and, on a GPU, a captured graph that serves all arms."""
+    """A fixed number of problems of one arm, with buffers and a captured graph that serves all arms."""
 
     def __init__(self, device: str, joints: int, size: int, iterations: int, posture_weight: float) -> None:
         self.model = _chain(device)
@@ -253,9 +254,10 @@ class _Problems:
             newton.ik.IKObjectiveJointLimit(model.joint_limit_lower, model.joint_limit_upper, weight=LIMIT_WEIGHT),
             self.posture,
         ]
-        self.solver = newton.ik.IKSolver(
-            model, size, objectives, jacobian_mode=newton.ik.IKJacobianType.ANALYTIC, lambda_initial=1e-3
-        )
+        with without_adjoints():
+            self.solver = newton.ik.IKSolver(
+                model, size, objectives, jacobian_mode=newton.ik.IKJacobianType.ANALYTIC, lambda_initial=1e-3
+            )
         self.has_run = False
         self.graph: wp.Graph | None = None
 
@@ -288,13 +290,13 @@ class _Problems:
         return self.joint_pos.numpy()[:count, :joints].astype(float)
 
     def _run(self) -> None:
-        """Run all steps; on a GPU the first run loads the kernels, the second records a graph, later ones replay it."""
-        if not self.device.is_cuda or not self.has_run:
+        """Run all steps; the first run loads the kernels, the second records a graph, later ones replay it."""
+        if not self.has_run:
             self._step()
             self.has_run = True
             return
         if self.graph is None:
-            with wp.ScopedCapture(self.device) as capture:
+            with PARSING, wp.ScopedCapture(self.device) as capture:  # on a CPU it records the launches of all threads
                 self._step()
             self.graph = capture.graph
         wp.capture_launch(self.graph)

@@ -1,8 +1,8 @@
 """Physics: commands to states, by MuJoCo Warp on a GPU and MuJoCo's C engine on a CPU.
 
 Both engines step the model that Newton compiles from the common template (template.py, worlds.py). `cpu` steps one world after
-another and is bit-repeatable. `gpu` steps all worlds of a batch together and is not, because a GPU adds contacts in any order.
-`plausibility` rejects implausible motions.
+another and is bit-repeatable; `compiled` makes its worlds. `gpu` steps all worlds of a batch together and is not, because a GPU
+adds contacts in any order. `plausibility` rejects implausible motions.
 """
 
 from collections.abc import Sequence

@@ -3,7 +3,7 @@
 import mujoco
 import numpy as np
 
-from xew.sim_warp.devices.newton import convert_quickly
+from xew.sim_warp.physics.compiled import compile_world
 from xew.sim_warp.physics.worlds import (
     FIRST_OBJECT,
     LEFT_ARM_LINKS,
@@ -13,11 +13,9 @@ from xew.sim_warp.physics.worlds import (
     TABLE,
     Motion,
     World,
-    build_solver,
     control_targets,
     initial_joints,
     motion,
-    shape_owners,
 )
 
 # Warnings are counted in `data.warning` and reported as overflow; by default MuJoCo also writes a log file.
@@ -30,11 +28,8 @@ class Stepper:
     """A world in the engine, stepped through commands as they come; it starts at the first command of `world`."""
 
     def __init__(self, world: World) -> None:
-        convert_quickly()
-        solver = build_solver([world], "cpu", use_mujoco_cpu=True)
-        self.world, self._model, self._data = world, solver.mj_model, solver.mj_data
-        labels = solver.model.shape_label
-        self._owners = shape_owners([labels[shape] for shape in solver.mjc_geom_to_newton_shape.numpy()[0]])
+        self._model, self._owners = compile_world(world)
+        self.world, self._data = world, mujoco.MjData(self._model)
         self._data.qpos[:] = initial_joints(world)
         mujoco.mj_forward(self._model, self._data)
         self._frames = [self._record()]

@@ -29,6 +29,8 @@ FREE_SLOTS = 3
 """Number of free bodies."""
 PARKED = tuple((0.3 * slot, 0.0, 0.3, 0.0, 0.0, 0.0, 1.0) for slot in range(FREE_SLOTS))
 """Poses (xyz [m] and quaternion xyzw) of unused free bodies, below the table."""
+PARKED_PARTS = (0.1, np.zeros(3), np.eye(3) * 1e-4)
+"""Mass [kg], center [3] and inertia [3 3] kg m2 of an unused body."""
 SIDES = ("left", "right")
 
 ARM_STIFFNESS, ARM_DAMPING, ARM_ARMATURE = 4000.0, 120.0, 1.0
@@ -191,7 +193,7 @@ def _add_arm(builder: "newton.ModelBuilder", side: str, arm: Arm, path: Path) ->
 
 def _add_body(builder: "newton.ModelBuilder", side: str, name: str, group: RigidGroup | None) -> int:
     """Add a body with a group's mass and shapes or, without a group, a small body for the pinned joint."""
-    mass, center, inertia = (group.mass, group.center, group.inertia) if group else (0.1, np.zeros(3), np.eye(3) * 1e-4)
+    mass, center, inertia = (group.mass, group.center, group.inertia) if group else PARKED_PARTS
     body = builder.add_link(
         mass=mass,
         com=wp.vec3(*center),
@@ -203,7 +205,7 @@ def _add_body(builder: "newton.ModelBuilder", side: str, name: str, group: Rigid
     has_pad = group is not None and "pad" in dict(group.hulls)  # without a pad, the whole finger of a user's URDF grips
     for label, points in group.hulls if group else ():
         friction = PAD_FRICTION if label == "pad" or (name.startswith("finger") and not has_pad) else LINK_FRICTION
-        _add_hull(builder, body, points, friction, ROBOT_GROUP[side], f"{side}_{name}")
+        _add_hull(builder, body, points, friction, f"{side}_{name}", ROBOT_GROUP[side])
     return body
 
 
@@ -264,10 +266,9 @@ def _add_finger_joint(
 
 
 def _add_objects(builder: "newton.ModelBuilder", scene: Scene) -> None:
-    table = trimesh.creation.box((TABLE_SIZE[0], TABLE_SIZE[1], TABLE_SIZE[2]))
-    center = [0, 0, TABLE_TOP + scene.raised - TABLE_SIZE[2] / 2]
-    _add_hull(builder, -1, table.vertices + center, LINK_FRICTION, OBJECT_GROUP, "table")
-    free = [thing for thing in scene.objects if not thing.is_fixed]
+    table, *fixed = fixed_shapes(scene)
+    _add_hull(builder, -1, *table, group=OBJECT_GROUP)
+    free = free_objects(scene)
     hinged = [thing for thing in scene.objects if thing.hinge]
     if len(free) > FREE_SLOTS or len(hinged) > 1 or any(not thing.is_fixed for thing in hinged):
         raise ConfigError(
@@ -277,12 +278,34 @@ def _add_objects(builder: "newton.ModelBuilder", scene: Scene) -> None:
     for slot in range(FREE_SLOTS):
         _add_free_slot(builder, slot, free[slot] if slot < len(free) else None, scene)
     _add_hinge_slot(builder, hinged[0] if hinged else None, scene)
+    for shape in fixed:
+        _add_hull(builder, -1, *shape, group=OBJECT_GROUP)
+
+
+Shape = tuple[np.ndarray, float, str]
+"""Points [k 3] of a convex piece in the frame of its body [m], sliding friction, and label."""
+
+
+def fixed_shapes(scene: Scene) -> list[Shape]:
+    """The shapes of the table and of fixed objects, in the world."""
+    table = trimesh.creation.box((TABLE_SIZE[0], TABLE_SIZE[1], TABLE_SIZE[2]))
+    shapes = [(table.vertices + [0, 0, TABLE_TOP + scene.raised - TABLE_SIZE[2] / 2], LINK_FRICTION, "table")]
     for thing in scene.objects:
         if thing.is_fixed:
             pose = matrix_from_pose(thing.pose)
-            for points in thing.shape.hulls:
-                points = points @ pose[:3, :3].T + pose[:3, 3]
-                _add_hull(builder, -1, points, thing.friction, OBJECT_GROUP, object_label(scene, thing))
+            placed = [points @ pose[:3, :3].T + pose[:3, 3] for points in thing.shape.hulls]
+            shapes += [(points, thing.friction, object_label(scene, thing)) for points in placed]
+    return shapes
+
+
+def free_objects(scene: Scene) -> list[SceneObject]:
+    """The objects in the free slots, in order."""
+    return [thing for thing in scene.objects if not thing.is_fixed]
+
+
+def free_shapes(scene: Scene, thing: SceneObject) -> list[Shape]:
+    """The shapes of a free object."""
+    return [(points, thing.friction, object_label(scene, thing)) for points in thing.shape.hulls]
 
 
 def object_label(scene: Scene, thing: SceneObject) -> str:
@@ -293,9 +316,11 @@ def object_label(scene: Scene, thing: SceneObject) -> str:
 def _add_free_slot(builder: "newton.ModelBuilder", slot: int, thing: SceneObject | None, scene: Scene) -> None:
     label = f"free{slot}"
     if thing is None:
+        mass, center, inertia = PARKED_PARTS
         body = builder.add_link(
-            mass=0.1,
-            inertia=wp.mat33(*(np.eye(3) * 1e-4).flatten()),
+            mass=mass,
+            com=wp.vec3(*center),
+            inertia=wp.mat33(*inertia.flatten()),
             xform=wp.transform(*PARKED[slot]),
             lock_inertia=True,
             label=label,
@@ -311,15 +336,15 @@ def _add_free_slot(builder: "newton.ModelBuilder", slot: int, thing: SceneObject
             lock_inertia=True,
             label=label,
         )
-        for points in thing.shape.hulls:
-            _add_hull(builder, body, points, thing.friction, OBJECT_GROUP, object_label(scene, thing))
+        for shape in free_shapes(scene, thing):
+            _add_hull(builder, body, *shape, group=OBJECT_GROUP)
     builder.add_articulation([builder.add_joint_free(child=body, label=f"{label}_free")], label=label)
 
 
 def _add_hinge_slot(builder: "newton.ModelBuilder", thing: SceneObject | None, scene: Scene) -> None:
     """Add a lid on a hinge in the world, or a pinned small body below the table."""
     if thing is None or thing.hinge is None:
-        parts = (0.1, np.zeros(3), np.eye(3) * 1e-4)
+        parts = PARKED_PARTS
         frame, axis = wp.transform((0, 0.3, 0.3), wp.quat_identity()), (0.0, 0.0, 1.0)
         settings = {"limit_lower": -1.0, "limit_upper": 1.0, "friction": 1.0, "damping": 1.0}
     else:
@@ -346,7 +371,7 @@ def _add_hinge_slot(builder: "newton.ModelBuilder", thing: SceneObject | None, s
     )
     if thing is not None and thing.hinge is not None:
         for points in thing.hinge.lid.hulls:
-            _add_hull(builder, body, points - thing.hinge.anchor, thing.friction, OBJECT_GROUP, object_label(scene, thing))
+            _add_hull(builder, body, points - thing.hinge.anchor, thing.friction, object_label(scene, thing), OBJECT_GROUP)
     joint = builder.add_joint_revolute(
         -1,
         body,
@@ -360,16 +385,21 @@ def _add_hinge_slot(builder: "newton.ModelBuilder", thing: SceneObject | None, s
     builder.add_articulation([joint], label="lid")
 
 
-def _add_hull(builder: "newton.ModelBuilder", body: int, points: np.ndarray, friction: float, group: int, label: str) -> None:
+def _add_hull(builder: "newton.ModelBuilder", body: int, points: np.ndarray, friction: float, label: str, group: int) -> None:
     builder.add_shape_convex_hull(
         body,
-        mesh=_hull(np.asarray(points, np.float32).tobytes()),
+        mesh=hull_mesh(points),
         cfg=newton.ModelBuilder.ShapeConfig(
             mu=friction, density=0.0, gap=0.0, ke=CONTACT_TIME**-2, kd=2 / CONTACT_TIME, collision_group=group
         ),
         label=label,
         custom_attributes={"mujoco:condim": 4},
     )
+
+
+def hull_mesh(points: np.ndarray) -> "newton.Mesh":
+    """The convex hull of points [k 3] in float32; equal points share one mesh."""
+    return _hull(np.asarray(points, np.float32).tobytes())
 
 
 @lru_cache(maxsize=4096)
