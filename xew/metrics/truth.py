@@ -158,7 +158,7 @@ def read_truth(
         body, local = (np.concatenate([getattr(some, name) for some in points]) for name in ("body", "local"))
         names = [surfaces.names[number] for number in body]
         outcome = know_outcome(record, states, names, local)
-        if outcome is not None and OF_VARIANTS & set(compared):
+        if outcome is not None:
             variants, own = find_variants(folder, record, frames, cache)
             outcome = replace(outcome, variants=variants, own=own)
     return Truth(

@@ -83,7 +83,7 @@ class Outcome:
 
     def true_poses(self, frames: int) -> np.ndarray:
         """Poses [t p 4 4] of the parts in the simulator."""
-        return self._poses_of(self.states)[:frames]
+        return self.poses_of(self.states)[:frames]
 
     def progress(self, poses: np.ndarray, frame: int) -> float:
         """Progress in a frame in which the parts have these poses [p 4 4]."""
@@ -119,7 +119,7 @@ class Outcome:
         assert self.variants is not None, "asked for by read_truth"
         own = self._points_at(poses)[frames]
         count = np.arange(len(poses))
-        others = (self._poses_of(variant) for variant in self.variants.variants)
+        others = (self.poses_of(variant) for variant in self.variants.variants)
         there = (self._points_at(other[np.minimum(count, len(other) - 1)])[frames] for other in others)
         return np.array([np.linalg.norm(own - points, axis=-1).mean() for points in there], np.float32)
 
@@ -128,7 +128,7 @@ class Outcome:
         matrix = poses[:, self.part[self.part >= 0]]
         return np.einsum("tkij,kj->tki", matrix[..., :3, :3], self.local[self.part >= 0]) + matrix[..., :3, 3]
 
-    def _poses_of(self, states: States | Variant) -> np.ndarray:
+    def poses_of(self, states: States | Variant) -> np.ndarray:
         """Poses [t p 4 4] of the parts in states of the scene."""
         from xew.sim_warp.geometry.poses import matrix_from_pose
         from xew.sim_warp.rendering.observe import scene_things
@@ -149,7 +149,7 @@ class Outcome:
                 base = matrix_from_pose(states.object_pose[0, part.index])
                 anchor[i] = base[:3, :3] @ part.hinge.anchor + base[:3, 3]
                 axis[i] = base[:3, :3] @ part.hinge.axis / np.linalg.norm(part.hinge.axis)
-        start = self._poses_of(states)[0]
+        start = self.poses_of(states)[0]
         hinged = np.array([part.hinge is not None for part in self.parts], bool)
         bodies = Bodies(*(fill_up(array, 0, BODY_BLOCK) for array in (start, hinged, anchor, axis)))
         extrinsics = np.broadcast_to(states.extrinsics, (len(states.action), 4, 4))[frame]

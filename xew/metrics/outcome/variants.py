@@ -11,12 +11,18 @@ from pathlib import Path
 import numpy as np
 
 from xew.episode import Record, data_folder, episode_folder, read_pixels, read_record, read_states
+from xew.metrics.estimators.images import soften
+from xew.metrics.estimators.presence import OTHER_COLOR, SOFTNESS
 from xew.metrics.perceptual import lpips_embedding
 from xew.protocol import split_fault
 
 INSTANTS = 8
 """Number of frames in which videos are compared by LPIPS. Each of k videos is compared with k others, and 8 frames cost about a
 twentieth of a whole video. An object that is dropped or missed stays where it is, so a few instants show it."""
+LEAST_SEEN = 16
+"""Number of pixels from which on an object is seen at an instant."""
+MOST = 0.5
+"""Share of an object's pixels with its color from which on a video shows it."""
 KEPT_SETS = 6
 """Number of sets that a process keeps, as many as threads grade at a time; the features of nine variants take about 40 MB."""
 
@@ -69,6 +75,23 @@ class CommandVariants:
         moved = np.append(np.any([variant.moved for variant in self.variants], axis=0), False)
         shown = np.any([moved[variant.shown] for variant in self.variants], axis=0)
         return shown & ~np.any([variant.robot for variant in self.variants], axis=0)
+
+    def is_shown(self, number: int, video: np.ndarray) -> bool:
+        """Whether a video [t h w 3] uint8 shows each object that moves under a variant where it ends up.
+
+        Most of the object's pixels must have its color there, at the last instant at which no robot hides it.
+        """
+        variant, frames = self.variants[number], video[instants(self.frames)]
+        for body in np.flatnonzero(variant.moved):
+            pixels = self.moving & (variant.shown == body)
+            seen = np.flatnonzero(pixels.sum(axis=(1, 2)) >= LEAST_SEEN)
+            if not len(seen):
+                continue
+            shown, true = (soften(images[seen[-1]].astype(np.float32), SOFTNESS) for images in (frames, variant.rgb))
+            same = np.abs(shown - true).max(axis=-1) <= OTHER_COLOR
+            if np.mean(same[pixels[seen[-1]]]) < MOST:
+                return False
+        return True
 
     def perceptual_distances(self, video: np.ndarray) -> np.ndarray:
         """LPIPS [v] float32 of a video [t h w 3] uint8 from the truth of each variant, in the moving regions.
