@@ -185,7 +185,7 @@ def judge_video(video: np.ndarray, truth: Truth, tracker: Tracker) -> Iterator[R
     """frame true judged: progress in frames of a video [t h w 3] uint8, and of the truth."""
     outcome, frames = truth.outcome, instants(len(video))
     assert outcome is not None
-    poses = Comparison(video, EpisodeCache(truth), open_masker("opencv"), tracker).outcome_poses
+    poses = Comparison(video, EpisodeCache(truth), open_masker("opencv"), tracker).judged_poses
     for frame in frames:
         yield {"frame": frame, "true": outcome.true_progress(frame), "judged": outcome.progress(poses[frame], frame)}
 

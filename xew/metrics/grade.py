@@ -107,7 +107,7 @@ class Comparison:
         return known
 
     @cached_property
-    def judged_poses(self) -> np.ndarray:
+    def tracked_poses(self) -> np.ndarray:
         """Poses [t p 4 4] of the parts of `Truth.outcome` in the prediction. The truth was read with its outcome."""
         assert self.truth.outcome is not None, "asked for by read_truth"
         kinds = ("object_points", "resting_points")
@@ -115,27 +115,18 @@ class Comparison:
         return self.truth.outcome.poses(tracks, np.concatenate([self.points[kind].visible for kind in kinds], axis=1))
 
     @cached_property
-    def variant_distances(self) -> np.ndarray | None:
-        """LPIPS [k] from the true videos of k variants of the commands, in moving regions; None if there are no others."""
-        outcome = self.truth.outcome
-        if outcome is None or outcome.variants is None or min(self.prediction.shape[1:3]) < SMALLEST_SIDE:
-            return None
-        return outcome.variants.perceptual_distances(self.prediction)
-
-    @cached_property
-    def outcome_poses(self) -> np.ndarray:
+    def judged_poses(self) -> np.ndarray:
         """Poses [t p 4 4] of the parts by which the outcome of the prediction is judged.
 
-        Objects are where the variant of the commands that looks most like the prediction has them. If the prediction does not
-        show them there, or the scene has no other commands, they are where the tracker finds them.
+        Objects are where a variant of the commands has them, if the prediction shows them there at the end; else, or if the
+        scene has no other commands, where the tracker finds them.
         """
-        outcome, distances = self.truth.outcome, self.variant_distances
-        if outcome is not None and outcome.variants is not None and distances is not None:
-            nearest = int(np.argmin(distances))
-            if outcome.variants.is_shown(nearest, self.prediction):
-                poses = outcome.poses_of(outcome.variants.variants[nearest])
-                return poses[np.minimum(np.arange(len(self.prediction)), len(poses) - 1)]
-        return self.judged_poses
+        outcome = self.truth.outcome
+        shown = outcome.variants.find_shown(self.prediction) if outcome is not None and outcome.variants is not None else None
+        if outcome is None or shown is None:
+            return self.tracked_poses
+        poses = outcome.poses_of(shown)
+        return poses[np.minimum(np.arange(len(self.prediction)), len(poses) - 1)]
 
     def estimate_masks(self) -> np.ndarray:
         """Robot masks [t h w] bool of all frames of the prediction."""
@@ -265,7 +256,7 @@ def _outcome(c: Comparison) -> Arrays | None:
     outcome, last = c.truth.outcome, len(c.prediction) - 1
     if outcome is None or not outcome.is_judged:
         return None
-    judged, true = outcome.progress(c.outcome_poses[last], last), outcome.true_progress(last)
+    judged, true = outcome.progress(c.judged_poses[last], last), outcome.true_progress(last)
     return np.array([judged], np.float32), np.array([true], np.float32)
 
 
@@ -275,13 +266,15 @@ def _variants(c: Comparison) -> Arrays | None:
     if outcome is None or not outcome.is_judged or outcome.variants is None:
         return None
     frames = slice(c.episode.first, len(c.prediction))
-    return outcome.distances(c.judged_poses, frames), _others(len(outcome.variants), outcome.own)
+    return outcome.distances(c.tracked_poses, frames), _others(len(outcome.variants), outcome.own)
 
 
 def _variant_videos(c: Comparison) -> Arrays | None:
     """LPIPS [k] from the true videos of k variants of the commands, in moving regions; the rest as of `_variants`."""
-    outcome, distances = c.truth.outcome, c.variant_distances
-    return None if outcome is None or distances is None else (distances, _others(len(distances), outcome.own))
+    outcome = c.truth.outcome
+    if outcome is None or outcome.variants is None or min(c.prediction.shape[1:3]) < SMALLEST_SIDE:
+        return None
+    return outcome.variants.perceptual_distances(c.prediction), _others(len(outcome.variants), outcome.own)
 
 
 def _others(count: int, own: int) -> np.ndarray:

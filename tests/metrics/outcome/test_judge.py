@@ -69,17 +69,15 @@ def test_a_block_that_is_nowhere_is_no_success(data: Path) -> None:
     truth = read_pushing(episode_folder(data, TASK, join_fault(3, 1), "piper"))
     assert truth.outcome is not None and truth.outcome.variants is not None
     erased = np.where(truth.labels[..., None] > 0, np.uint8(200), truth.rgb)
-    assert truth.outcome.variants.is_shown(truth.outcome.own, truth.rgb)
-    assert not truth.outcome.variants.is_shown(truth.outcome.own, erased)
+    assert truth.outcome.variants.find_shown(truth.rgb) is truth.outcome.variants.variants[truth.outcome.own]
+    assert truth.outcome.variants.find_shown(erased) is None
 
 
 def test_poses_of_objects_are_those_of_the_simulator(data: Path) -> None:
     folder = episode_folder(data, TASK, 1, "piper")
     truth = read_truth(folder, 12, ("outcome",))
     outcome = truth.outcome
-    assert (
-        outcome is not None and outcome.variants is not None and truth.surfaces is not None and truth.surfaces.resting is not None
-    )
+    assert outcome is not None and truth.surfaces is not None and truth.surfaces.resting is not None
     poses = outcome.poses(truth.surfaces.resting.pixels, truth.surfaces.resting.visible)
     np.testing.assert_allclose(poses, outcome.true_poses(12), atol=2e-3)
     place, joint = outcome.place(poses[-1])

@@ -60,7 +60,7 @@ class Programs:
         truth = Truth(target, mask, points, points[..., 0] > 0, points, points[..., 0] > 0)
         prediction = np.roll(target, 1, axis=0)
         grade(Comparison(prediction, EpisodeCache(truth, 0), lambda *_: mask, lambda *_: points), self.metrics)
-        if any(METRICS[name].inputs in JUDGED for name in self.metrics):
+        if any(METRICS[name].inputs == "variant_videos" for name in self.metrics):
             perceptual.lpips_embedding(target[:INSTANTS], mask[:INSTANTS])
 
 
@@ -113,8 +113,8 @@ def list_programs(settings: GradingSettings, jobs: Sequence[Job]) -> list[Progra
     parts: dict[str, list[str]] = {}
     for name in settings.metrics:
         metric = METRICS[name]
-        of_network = metric.function.__module__ == perceptual.__name__ or metric.inputs in JUDGED
-        if metric.inputs != "track":
+        of_network = metric.function.__module__ == perceptual.__name__ or metric.inputs == "variant_videos"
+        if metric.inputs not in ("track", "outcome", "variants"):
             parts.setdefault("network" if of_network else "whole" if metric.whole else "frame", []).append(name)
     return [Programs(tuple(names), _find_shapes(settings, jobs)) for names in parts.values()]
 

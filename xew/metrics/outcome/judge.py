@@ -1,7 +1,8 @@
 """A judge of outcomes without weights: objects' poses in a predicted video, and the progress of a task that they mean.
 
 The judge knows what a model was given: the scene at first, the camera, and the commands. The hands' paths are those that the
-commands had in the simulator; a hand touches what it is near to.
+commands had in the simulator; a hand touches what it is near to. Objects are where a variant of the commands has them, if the
+video shows them there (`variants.py`), else where their points are tracked (`poses.py`).
 """
 
 from collections.abc import Sequence
@@ -54,7 +55,7 @@ class Outcome:
     part: np.ndarray
     """[k] int, the part of each, -1 for none."""
     variants: CommandVariants | None = None
-    """All variants of the commands in this scene, these among them; None if there are no others or nobody asks."""
+    """All variants of the commands in this scene, these among them; None if there are no others."""
     own: int = 0
     """The number of these commands among the variants."""
 

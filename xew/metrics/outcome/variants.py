@@ -20,7 +20,7 @@ INSTANTS = 8
 """Number of frames in which videos are compared by LPIPS. Each of k videos is compared with k others, and 8 frames cost about a
 twentieth of a whole video. An object that is dropped or missed stays where it is, so a few instants show it."""
 LEAST_SEEN = 16
-"""Number of pixels from which on an object is seen at an instant."""
+"""Number of pixels from which on an object is seen."""
 MOST = 0.5
 """Share of an object's pixels with its color from which on a video shows it."""
 KEPT_SETS = 6
@@ -76,22 +76,19 @@ class CommandVariants:
         shown = np.any([moved[variant.shown] for variant in self.variants], axis=0)
         return shown & ~np.any([variant.robot for variant in self.variants], axis=0)
 
-    def is_shown(self, number: int, video: np.ndarray) -> bool:
-        """Whether a video [t h w 3] uint8 shows each object that moves under a variant where it ends up.
+    def find_shown(self, video: np.ndarray) -> Variant | None:
+        """The variant whose objects end where a video [t h w 3] uint8 shows them; None if it shows them at no variant's places.
 
-        Most of the object's pixels must have its color there, at the last instant at which no robot hides it.
+        It is the one with the most similar last frame, by squared differences of color in moving regions. In most of the
+        pixels in which it shows an object that it has moved, the video must have the same color.
         """
-        variant, frames = self.variants[number], video[instants(self.frames)]
-        for body in np.flatnonzero(variant.moved):
-            pixels = self.moving & (variant.shown == body)
-            seen = np.flatnonzero(pixels.sum(axis=(1, 2)) >= LEAST_SEEN)
-            if not len(seen):
-                continue
-            shown, true = (soften(images[seen[-1]].astype(np.float32), SOFTNESS) for images in (frames, variant.rgb))
-            same = np.abs(shown - true).max(axis=-1) <= OTHER_COLOR
-            if np.mean(same[pixels[seen[-1]]]) < MOST:
-                return False
-        return True
+        region, end = self.moving[-1], _soften(video[self.frames - 1])
+        differences = [end - _soften(variant.rgb[-1]) for variant in self.variants]
+        nearest = int(np.argmin([np.square(difference[region]).sum() for difference in differences]))
+        variant, same = self.variants[nearest], np.abs(differences[nearest]).max(axis=-1) <= OTHER_COLOR
+        places = [region & (variant.shown[-1] == body) for body in np.flatnonzero(variant.moved)]
+        is_shown = all(same[place].mean() >= MOST for place in places if place.sum() >= LEAST_SEEN)
+        return variant if region.any() and is_shown else None
 
     def perceptual_distances(self, video: np.ndarray) -> np.ndarray:
         """LPIPS [v] float32 of a video [t h w 3] uint8 from the truth of each variant, in the moving regions.
@@ -134,6 +131,11 @@ def find_variants(folder: Path, record: Record, frames: int, surfaces: Path | No
         return None, 0
     own = next(number for number, path in enumerate(kept) if path.samefile(folder))
     return _open_variants(tuple(kept), tuple(kept.values()), frames, surfaces), own
+
+
+def _soften(frame: np.ndarray) -> np.ndarray:
+    """A frame [h w 3] uint8 as float32, softened as trackers see it."""
+    return soften(frame.astype(np.float32), SOFTNESS)
 
 
 def instants(frames: int, count: int = INSTANTS) -> np.ndarray:
