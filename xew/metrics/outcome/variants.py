@@ -21,7 +21,7 @@ INSTANTS = 8
 twentieth of a whole video. An object that is dropped or missed stays where it is, so a few instants show it."""
 LEAST_SEEN = 16
 """Number of pixels from which on an object is seen."""
-MOST = 0.5
+MOST = 0.75
 """Share of an object's pixels with its color from which on a video shows it."""
 KEPT_SETS = 6
 """Number of sets that a process keeps, as many as threads grade at a time; the features of nine variants take about 40 MB."""
@@ -79,15 +79,15 @@ class CommandVariants:
     def find_shown(self, video: np.ndarray) -> Variant | None:
         """The variant whose objects end where a video [t h w 3] uint8 shows them; None if it shows them at no variant's places.
 
-        It is the one with the most similar last frame, by squared differences of color in moving regions. In most of the
-        pixels in which it shows an object that it has moved, the video must have the same color.
+        It is the one with the most similar last frame, by squared differences of color in moving regions. Each object that it
+        has moved must be seen, and most of these pixels must have the same color in the video.
         """
         region, end = self.moving[-1], _soften(video[self.frames - 1])
         differences = [end - _soften(variant.rgb[-1]) for variant in self.variants]
         nearest = int(np.argmin([np.square(difference[region]).sum() for difference in differences]))
         variant, same = self.variants[nearest], np.abs(differences[nearest]).max(axis=-1) <= OTHER_COLOR
         places = [region & (variant.shown[-1] == body) for body in np.flatnonzero(variant.moved)]
-        is_shown = all(same[place].mean() >= MOST for place in places if place.sum() >= LEAST_SEEN)
+        is_shown = all(place.sum() >= LEAST_SEEN and same[place].mean() >= MOST for place in places)
         return variant if region.any() and is_shown else None
 
     def perceptual_distances(self, video: np.ndarray) -> np.ndarray:
