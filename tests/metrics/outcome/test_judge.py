@@ -65,6 +65,14 @@ def test_success_is_what_the_video_shows_whatever_the_commands_cause(data: Path)
         np.testing.assert_array_equal([grade(obedient, names).values[name] for name in names], expected)
 
 
+def test_a_scene_with_one_command_is_judged_by_tracking(data: Path) -> None:
+    still, pushed = (read_pushing(episode_folder(data, TASK, seed, "piper")) for seed in (1, join_fault(3, 1)))
+    assert still.outcome is not None
+    alone = EpisodeCache(replace(still, outcome=replace(still.outcome, variants=None)))
+    comparison = Comparison(pushed.rgb, alone, open_masker("opencv"), lambda seen, true, points, visible: points)
+    assert comparison.judged_poses is comparison.tracked_poses
+
+
 def test_a_block_that_is_nowhere_is_no_success(data: Path) -> None:
     truth = read_pushing(episode_folder(data, TASK, join_fault(3, 1), "piper"))
     assert truth.outcome is not None and truth.outcome.variants is not None
