@@ -107,12 +107,26 @@ class Comparison:
         return known
 
     @cached_property
-    def judged_poses(self) -> np.ndarray:
+    def tracked_poses(self) -> np.ndarray:
         """Poses [t p 4 4] of the parts of `Truth.outcome` in the prediction. The truth was read with its outcome."""
         assert self.truth.outcome is not None, "asked for by read_truth"
         kinds = ("object_points", "resting_points")
         tracks = np.concatenate([self.track(kind) for kind in kinds], axis=1)
         return self.truth.outcome.poses(tracks, np.concatenate([self.points[kind].visible for kind in kinds], axis=1))
+
+    @cached_property
+    def judged_poses(self) -> np.ndarray:
+        """Poses [t p 4 4] of the parts by which the outcome of the prediction is judged.
+
+        Objects are where a variant of the commands has them, if the prediction shows them there at the end; else, or if the
+        scene has no other commands, where the tracker finds them.
+        """
+        outcome = self.truth.outcome
+        shown = outcome.variants.find_shown(self.prediction) if outcome is not None and outcome.variants is not None else None
+        if outcome is None or shown is None:
+            return self.tracked_poses
+        poses = outcome.poses_of(shown)
+        return poses[np.minimum(np.arange(len(self.prediction)), len(poses) - 1)]
 
     def estimate_masks(self) -> np.ndarray:
         """Robot masks [t h w] bool of all frames of the prediction."""
@@ -252,7 +266,7 @@ def _variants(c: Comparison) -> Arrays | None:
     if outcome is None or not outcome.is_judged or outcome.variants is None:
         return None
     frames = slice(c.episode.first, len(c.prediction))
-    return outcome.distances(c.judged_poses, frames), _others(len(outcome.variants), outcome.own)
+    return outcome.distances(c.tracked_poses, frames), _others(len(outcome.variants), outcome.own)
 
 
 def _variant_videos(c: Comparison) -> Arrays | None:

@@ -31,9 +31,7 @@ NEEDS = {
     "variant_videos": OUTCOME_NEEDS,
 }
 """Arrays of an episode that each kind of comparison rests on; imported episodes may not know some."""
-OF_VARIANTS = frozenset({"variants", "variant_videos"})
-"""Kinds of comparison with other commands in the scene."""
-OF_OUTCOME = OF_VARIANTS | {"outcome"}
+OF_OUTCOME = frozenset({"outcome", "variants", "variant_videos"})
 """Kinds of comparison that rest on `Truth.outcome`, which asks for points on objects."""
 WITH_SURFACES = frozenset(NEEDS) - {"video", "region", "robot"}
 """Kinds of comparison that look for bodies, which surfaces tell apart."""
@@ -158,7 +156,7 @@ def read_truth(
         body, local = (np.concatenate([getattr(some, name) for some in points]) for name in ("body", "local"))
         names = [surfaces.names[number] for number in body]
         outcome = know_outcome(record, states, names, local)
-        if outcome is not None and OF_VARIANTS & set(compared):
+        if outcome is not None:
             variants, own = find_variants(folder, record, frames, cache)
             outcome = replace(outcome, variants=variants, own=own)
     return Truth(

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from tests.metrics.grading.graded import ASKED
-from xew.metrics import METRICS
+from xew.metrics import METRICS, lpips_embedding
 from xew.metrics.episode_cache import EpisodeCache
 from xew.metrics.estimators.batched import compiling
 from xew.metrics.grade import Comparison, grade
@@ -19,6 +19,7 @@ from xew.metrics.grading import list_jobs, open_graders, warm_up
 from xew.metrics.grading.codecs import ModelCodec
 from xew.metrics.grading.settings import Args, GradingSettings, resolve
 from xew.metrics.grading.warm_up import CodecPrograms, Kernels, Programs
+from xew.metrics.outcome.variants import instants
 from xew.metrics.truth import Truth
 from xew.protocol import CODEC_TRUTH
 
@@ -53,6 +54,7 @@ def test_programs_are_those_of_all_videos_that_are_filled_up_alike(monkeypatch: 
     truth = Truth(video, mask, nothing, nothing[..., 0] > 0, nothing, nothing[..., 0] > 0)
     graded = grade(Comparison(prediction, EpisodeCache(truth, 0), lambda *_: ~mask, lambda *_: nothing), metrics)
     assert graded.values.keys() == set(metrics) and 0 < graded.values["region_lpips"] < 1
+    lpips_embedding(prediction[instants(frames)], mask[instants(frames)])
     assert compiled.count(COMPILED) == 0
 
 

@@ -1,5 +1,6 @@
 """The judge on an episode of the simulation: a block on a table, and hands that close."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from xew.metrics.backends import open_masker, open_tracker
 from xew.metrics.episode_cache import EpisodeCache
 from xew.metrics.grade import Comparison, Grades, grade
 from xew.metrics.grading.settings import WITHOUT_OUTCOME, Args, resolve
-from xew.metrics.truth import read_truth
+from xew.metrics.truth import Truth, read_truth
 from xew.protocol import OUTCOME, join_fault
 
 NAMES = tuple(name for name, metric in METRICS.items() if metric.dimension == OUTCOME)
@@ -39,13 +40,52 @@ def test_a_block_that_should_have_moved_is_not_retrieved(data: Path) -> None:
         assert judge(expert, read_pixels(faulty, "rgb")).values[name] == 0
 
 
+WAY = 0.04
+"""Way of the block to the right [m] that is a success."""
+
+
+def read_pushing(folder: Path) -> Truth:
+    """An episode whose task is to push the block."""
+    truth = read_truth(folder, read_record(folder).frame_count, ("outcome",))
+    assert truth.outcome is not None
+    pushed = replace(truth.outcome.task, success=lambda scene, now: now.object_pose[0, 0] > scene.objects[0].pose[0] + WAY)
+    return replace(truth, outcome=replace(truth.outcome, task=pushed))
+
+
+def test_success_is_what_the_video_shows_whatever_the_commands_cause(data: Path) -> None:
+    still, pushed = (read_pushing(episode_folder(data, TASK, seed, "piper")) for seed in (1, join_fault(3, 1)))
+    names = ("outcome_accuracy", "hallucinated_success")
+    for truth, video, expected in (
+        (still, still.rgb, [1, 0]),
+        (still, pushed.rgb, [0, 1]),
+        (pushed, pushed.rgb, [1, np.nan]),
+        (pushed, still.rgb, [0, np.nan]),
+    ):
+        obedient = Comparison(video, EpisodeCache(truth), open_masker("opencv"), lambda seen, true, points, visible: points)
+        np.testing.assert_array_equal([grade(obedient, names).values[name] for name in names], expected)
+
+
+def test_a_scene_with_one_command_is_judged_by_tracking(data: Path) -> None:
+    still, pushed = (read_pushing(episode_folder(data, TASK, seed, "piper")) for seed in (1, join_fault(3, 1)))
+    assert still.outcome is not None
+    alone = EpisodeCache(replace(still, outcome=replace(still.outcome, variants=None)))
+    comparison = Comparison(pushed.rgb, alone, open_masker("opencv"), lambda seen, true, points, visible: points)
+    assert comparison.judged_poses is comparison.tracked_poses
+
+
+def test_a_block_that_is_nowhere_is_no_success(data: Path) -> None:
+    truth = read_pushing(episode_folder(data, TASK, join_fault(3, 1), "piper"))
+    assert truth.outcome is not None and truth.outcome.variants is not None
+    erased = np.where(truth.labels[..., None] > 0, np.uint8(200), truth.rgb)
+    assert truth.outcome.variants.find_shown(truth.rgb) is truth.outcome.variants.variants[truth.outcome.own]
+    assert truth.outcome.variants.find_shown(erased) is None
+
+
 def test_poses_of_objects_are_those_of_the_simulator(data: Path) -> None:
     folder = episode_folder(data, TASK, 1, "piper")
     truth = read_truth(folder, 12, ("outcome",))
     outcome = truth.outcome
-    assert (
-        outcome is not None and outcome.variants is None and truth.surfaces is not None and truth.surfaces.resting is not None
-    )
+    assert outcome is not None and truth.surfaces is not None and truth.surfaces.resting is not None
     poses = outcome.poses(truth.surfaces.resting.pixels, truth.surfaces.resting.visible)
     np.testing.assert_allclose(poses, outcome.true_poses(12), atol=2e-3)
     place, joint = outcome.place(poses[-1])

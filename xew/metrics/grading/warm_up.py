@@ -21,6 +21,7 @@ from xew.metrics.grading.codecs import ModelCodec, open_codec
 from xew.metrics.grading.list_jobs import Job
 from xew.metrics.grading.settings import GradingSettings
 from xew.metrics.metric import ACCELERATOR_CHUNK
+from xew.metrics.outcome.variants import INSTANTS
 from xew.metrics.truth import Truth
 from xew.protocol import CODEC_TRUTH
 
@@ -59,6 +60,8 @@ class Programs:
         truth = Truth(target, mask, points, points[..., 0] > 0, points, points[..., 0] > 0)
         prediction = np.roll(target, 1, axis=0)
         grade(Comparison(prediction, EpisodeCache(truth, 0), lambda *_: mask, lambda *_: points), self.metrics)
+        if any(METRICS[name].inputs == "variant_videos" for name in self.metrics):
+            perceptual.lpips_embedding(target[:INSTANTS], mask[:INSTANTS])
 
 
 @dataclass(frozen=True)
@@ -110,8 +113,8 @@ def list_programs(settings: GradingSettings, jobs: Sequence[Job]) -> list[Progra
     parts: dict[str, list[str]] = {}
     for name in settings.metrics:
         metric = METRICS[name]
-        of_network = metric.function.__module__ == perceptual.__name__
-        if metric.inputs not in ("track", *JUDGED):
+        of_network = metric.function.__module__ == perceptual.__name__ or metric.inputs == "variant_videos"
+        if metric.inputs not in ("track", "outcome", "variants"):
             parts.setdefault("network" if of_network else "whole" if metric.whole else "frame", []).append(name)
     return [Programs(tuple(names), _find_shapes(settings, jobs)) for names in parts.values()]
 

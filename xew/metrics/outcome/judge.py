@@ -1,7 +1,8 @@
 """A judge of outcomes without weights: objects' poses in a predicted video, and the progress of a task that they mean.
 
 The judge knows what a model was given: the scene at first, the camera, and the commands. The hands' paths are those that the
-commands had in the simulator; a hand touches what it is near to.
+commands had in the simulator; a hand touches what it is near to. Objects are where a variant of the commands has them, if the
+video shows them there (`variants.py`), else where their points are tracked (`poses.py`).
 """
 
 from collections.abc import Sequence
@@ -54,7 +55,7 @@ class Outcome:
     part: np.ndarray
     """[k] int, the part of each, -1 for none."""
     variants: CommandVariants | None = None
-    """All variants of the commands in this scene, these among them; None if there are no others or nobody asks."""
+    """All variants of the commands in this scene, these among them; None if there are no others."""
     own: int = 0
     """The number of these commands among the variants."""
 
@@ -83,7 +84,7 @@ class Outcome:
 
     def true_poses(self, frames: int) -> np.ndarray:
         """Poses [t p 4 4] of the parts in the simulator."""
-        return self._poses_of(self.states)[:frames]
+        return self.poses_of(self.states)[:frames]
 
     def progress(self, poses: np.ndarray, frame: int) -> float:
         """Progress in a frame in which the parts have these poses [p 4 4]."""
@@ -119,7 +120,7 @@ class Outcome:
         assert self.variants is not None, "asked for by read_truth"
         own = self._points_at(poses)[frames]
         count = np.arange(len(poses))
-        others = (self._poses_of(variant) for variant in self.variants.variants)
+        others = (self.poses_of(variant) for variant in self.variants.variants)
         there = (self._points_at(other[np.minimum(count, len(other) - 1)])[frames] for other in others)
         return np.array([np.linalg.norm(own - points, axis=-1).mean() for points in there], np.float32)
 
@@ -128,7 +129,7 @@ class Outcome:
         matrix = poses[:, self.part[self.part >= 0]]
         return np.einsum("tkij,kj->tki", matrix[..., :3, :3], self.local[self.part >= 0]) + matrix[..., :3, 3]
 
-    def _poses_of(self, states: States | Variant) -> np.ndarray:
+    def poses_of(self, states: States | Variant) -> np.ndarray:
         """Poses [t p 4 4] of the parts in states of the scene."""
         from xew.sim_warp.geometry.poses import matrix_from_pose
         from xew.sim_warp.rendering.observe import scene_things
@@ -149,7 +150,7 @@ class Outcome:
                 base = matrix_from_pose(states.object_pose[0, part.index])
                 anchor[i] = base[:3, :3] @ part.hinge.anchor + base[:3, 3]
                 axis[i] = base[:3, :3] @ part.hinge.axis / np.linalg.norm(part.hinge.axis)
-        start = self._poses_of(states)[0]
+        start = self.poses_of(states)[0]
         hinged = np.array([part.hinge is not None for part in self.parts], bool)
         bodies = Bodies(*(fill_up(array, 0, BODY_BLOCK) for array in (start, hinged, anchor, axis)))
         extrinsics = np.broadcast_to(states.extrinsics, (len(states.action), 4, 4))[frame]

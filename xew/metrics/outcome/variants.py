@@ -11,12 +11,18 @@ from pathlib import Path
 import numpy as np
 
 from xew.episode import Record, data_folder, episode_folder, read_pixels, read_record, read_states
+from xew.metrics.estimators.images import soften
+from xew.metrics.estimators.presence import OTHER_COLOR, SOFTNESS
 from xew.metrics.perceptual import lpips_embedding
 from xew.protocol import split_fault
 
 INSTANTS = 8
 """Number of frames in which videos are compared by LPIPS. Each of k videos is compared with k others, and 8 frames cost about a
 twentieth of a whole video. An object that is dropped or missed stays where it is, so a few instants show it."""
+LEAST_SEEN = 16
+"""Number of pixels from which on an object is seen."""
+MOST = 0.75
+"""Share of an object's pixels with its color from which on a video shows it."""
 KEPT_SETS = 6
 """Number of sets that a process keeps, as many as threads grade at a time; the features of nine variants take about 40 MB."""
 
@@ -70,6 +76,20 @@ class CommandVariants:
         shown = np.any([moved[variant.shown] for variant in self.variants], axis=0)
         return shown & ~np.any([variant.robot for variant in self.variants], axis=0)
 
+    def find_shown(self, video: np.ndarray) -> Variant | None:
+        """The variant whose objects end where a video [t h w 3] uint8 shows them; None if it shows them at no variant's places.
+
+        It is the one with the most similar last frame, by squared differences of color in moving regions. Each object that it
+        has moved must be seen, and most of these pixels must have the same color in the video.
+        """
+        region, end = self.moving[-1], _soften(video[self.frames - 1])
+        differences = [end - _soften(variant.rgb[-1]) for variant in self.variants]
+        nearest = int(np.argmin([np.square(difference[region]).sum() for difference in differences]))
+        variant, same = self.variants[nearest], np.abs(differences[nearest]).max(axis=-1) <= OTHER_COLOR
+        places = [region & (variant.shown[-1] == body) for body in np.flatnonzero(variant.moved)]
+        is_shown = all(place.sum() >= LEAST_SEEN and same[place].mean() >= MOST for place in places)
+        return variant if region.any() and is_shown else None
+
     def perceptual_distances(self, video: np.ndarray) -> np.ndarray:
         """LPIPS [v] float32 of a video [t h w 3] uint8 from the truth of each variant, in the moving regions.
 
@@ -111,6 +131,11 @@ def find_variants(folder: Path, record: Record, frames: int, surfaces: Path | No
         return None, 0
     own = next(number for number, path in enumerate(kept) if path.samefile(folder))
     return _open_variants(tuple(kept), tuple(kept.values()), frames, surfaces), own
+
+
+def _soften(frame: np.ndarray) -> np.ndarray:
+    """A frame [h w 3] uint8 as float32, softened as trackers see it."""
+    return soften(frame.astype(np.float32), SOFTNESS)
 
 
 def instants(frames: int, count: int = INSTANTS) -> np.ndarray:
