@@ -33,7 +33,6 @@ LAB = (
     "tests/analysis/test_results.py::test_published_tables_and_sentences_are_those_of_the_scores[own_motion]",
     "tests/analysis/test_results.py::test_published_tables_and_sentences_are_those_of_the_scores[remedies]",
     "tests/analysis/test_results.py::test_published_tables_and_sentences_are_those_of_the_scores[six_tasks]",
-    "tests/analysis/test_results.py::test_published_tables_and_sentences_are_those_of_the_scores[small_size]",
     "tests/faults/test_disks.py::test_what_a_disk_refuses_is_one_line_and_nothing_is_lost",
     "tests/lab/",
     "tests/metrics/estimators/batched/test_batched.py::test_scores_of_the_predictors_are_the_same",

@@ -86,7 +86,7 @@ def test_other_systems(label: str, group: str) -> None:
     demand(" ".join(row_of("six_tasks", label)), [mean("six_tasks", name, group, "lpips") for name in names])
 
 
-SMALL = {
+MAIN = {
     "LPIPS ↓": "lpips",
     "PSNR [dB] ↑": "psnr",
     "mask IoU ↑": "mask_iou",
@@ -94,7 +94,7 @@ SMALL = {
     "keypoint error, strict [px] ↓": "keypoint_error_strict",
     "robot LPIPS ↓": "robot_lpips",
 }
-RECIPE = SMALL | {"gripper error [px] ↓": "gripper_error", "flicker [levels] ↓": "flicker"}
+RECIPE = MAIN | {"gripper error [px] ↓": "gripper_error", "flicker [levels] ↓": "flicker"}
 
 
 def recipe(metric: str, group: str, folder: str = "recipe") -> tuple[float, float]:
@@ -132,14 +132,6 @@ def test_each_task_of_the_recommended_recipe() -> None:
     assert len(shown) == own["task"].nunique() == 25
     first = [float(cells[1].split(" ")[0]) for cells in shown]
     assert first == sorted(first)
-
-
-@pytest.mark.parametrize("label", SMALL)
-def test_older_recipes(label: str) -> None:
-    models = sorted(grades_of("small_size").variants)
-    channels, pasted = (next(name for name in models if part in name) for part in ("small_channels", "small_pasted"))
-    for cell, group in zip(row_of("small_size", label), ("seen", "franka", "piper"), strict=True):
-        demand(cell, [mean("small_size", name, group, SMALL[label]) for name in (channels, pasted, PASTED_RENDER)])
 
 
 SCALING = {f"three robots, K = {count}": f"scaling_seen_bodies_{count}" for count in (4, 16, 64)}

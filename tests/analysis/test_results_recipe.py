@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from tests.analysis.test_results_pages import GROUPS, RESULTS, SMALL, demand, recipe, row_of
+from tests.analysis.test_results_pages import GROUPS, MAIN, RESULTS, demand, recipe, row_of
 from tests.analysis.test_results_sentences import COMMIT, read_old
 from xew.analysis.scores import read_scores
 from xew.protocol import BASELINES, HELD_OUT_ROBOTS, PASTED_RENDER, ROBOT_NAMES, SEEN_ROBOTS
@@ -47,8 +47,8 @@ def test_the_recommended_recipe_beats_pasting() -> None:
     pairs = verdicts_on_the_recipe()
     worse = pairs[pairs["verdict"] == "worse"]
     assert set(worse["metric"]) == {"flicker"} and len(worse) == 2 * (1 + len(ROBOT_NAMES))
-    main = pairs[pairs["metric"].isin(SMALL.values())]
-    assert (main["verdict"] == "better").all() and len(main) == 2 * (1 + len(ROBOT_NAMES)) * len(SMALL)
+    main = pairs[pairs["metric"].isin(MAIN.values())]
+    assert (main["verdict"] == "better").all() and len(main) == 2 * (1 + len(ROBOT_NAMES)) * len(MAIN)
     grippers = pairs[(pairs["metric"] == "gripper_error") & pairs["robot"].isin(HELD_OUT_ROBOTS)]
     assert (grippers["verdict"] == "unresolved").all()
 

@@ -331,7 +331,6 @@ SENTENCES: list[tuple[str, str, Callable[[], Numbers]]] = [
         lambda: [cell("six_tasks", "gap_correlations", "LPIPS ↓", f"{KINEMATIC}: p")],
     ),
     ("six_tasks", "scores {:.0f} on Franka", lambda: [mean("six_tasks", GROUND_TRUTH, "franka", "ndtw")]),
-    ("small_size", "scores {:.0f}.", lambda: [mean("small_size", GROUND_TRUTH, "franka", "ndtw")]),
     ("reproduce_the_paper", "on Franka and {:.0f} % on Piper (paper 41", lambda: list(render_gains())[1:]),
     ("reproduce_the_paper", "LPIPS by {:.0f} % on Franka", lambda: list(render_gains())[:1]),
     ("reproduce_the_paper", "Piper (paper {:.0f} and {:.0f} %); a", paper_renders),
@@ -472,32 +471,6 @@ def read_old(place: str) -> pd.DataFrame:
     if found.returncode:
         pytest.skip(f"git has no commit {COMMIT} here, as in a shallow clone")
     return pd.read_parquet(io.BytesIO(found.stdout))
-
-
-@cache
-def read_curves(folder: str) -> pd.DataFrame:
-    """LPIPS by frame of all models, and the last frame of each episode; from the commit that has it."""
-    rows = read_old(f"{COMMIT}:docs/results/{folder}/scores.curves.parquet")
-    rows = rows[(rows["metric"] == "lpips") & ~rows["model"].isin(BASELINES)]
-    last = rows.groupby(["model", "task", "seed", "robot"], observed=True)["frame"].transform("max")
-    return rows.assign(begins=rows["frame"] <= 32, ends=rows["frame"] > last - 32)
-
-
-def drift(folder: str, model: str, group: str) -> tuple[float, float]:
-    """LPIPS of the first and of the last 32 predicted frames."""
-    rows = read_curves(folder)
-    rows = rows[(rows["model"] == model) & rows["robot"].isin(GROUPS[group])]
-    return float(rows.loc[rows["begins"], "value"].mean()), float(rows.loc[rows["ends"], "value"].mean())
-
-
-def test_drift_of_older_recipes() -> None:
-    ratios = {}
-    for model in ("small_pasted", "small_channels"):
-        found = [drift("small_size", model, group) for group in ("seen", "franka", "piper")]
-        ratios[model] = [f"{end(last / first for first, last in found):.1f}" for end in (min, max)]
-    page = read_page("small_size")
-    assert "have {} to {} times the LPIPS".format(*ratios["small_pasted"]) in page
-    assert "it is {} to {} times".format(*ratios["small_channels"]) in page
 
 
 def test_numbers_of_training_runs() -> None:

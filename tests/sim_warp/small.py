@@ -70,7 +70,7 @@ def produce(
 class InlineWorkers:
     """Workers that do their jobs in the test's own process: a process of their own imports for several seconds."""
 
-    def __init__(self, count: int, devices: Sequence[Any] = ()) -> None:
+    def __init__(self, count: int, devices: Sequence[Any] = (), imported: Sequence[str] = ()) -> None:
         self.count = count
 
     def __enter__(self) -> "InlineWorkers":
