@@ -38,7 +38,6 @@ from xew.analysis.tables.comparisons import Reader
 from xew.analysis.tables.distances import read_distances
 from xew.analysis.tables.findings import FAILS, HOLDS, UNMEASURED, ask
 from xew.protocol import (
-    BASELINES,
     CODEC_TRUTH,
     COPY_FIRST_FRAME,
     DISTANCE_BODIES,
