@@ -3,9 +3,7 @@
 Each line names the pages, the sentence with a place for each number, and the function that computes them.
 """
 
-import io
 import re
-import subprocess
 from collections.abc import Callable, Iterable
 from functools import cache
 
@@ -50,8 +48,6 @@ from xew.protocol import (
 )
 
 DOCS = RESULTS.parent
-COMMIT = "7e04e87"
-"""The commit that pages name, which has the scores by frame."""
 PAPER_CLAIMS = [claim for claim in CLAIMS if claim.where != "ours"]
 Numbers = Iterable[float | str]
 
@@ -462,14 +458,6 @@ def test_distances_of_the_five_robots() -> None:
         for rows in (robot_features(feature),)
     }
     assert within["reach"].all() and list(within["volume"][~within["volume"]].index) == ["aloha_agilex", "ur5_wsg"]
-
-
-def read_old(place: str) -> pd.DataFrame:
-    """A table of another commit."""
-    found = subprocess.run(["git", "show", place], capture_output=True, cwd=RESULTS)
-    if found.returncode:
-        pytest.skip(f"git has no commit {COMMIT} here, as in a shallow clone")
-    return pd.read_parquet(io.BytesIO(found.stdout))
 
 
 def test_numbers_of_training_runs() -> None:
