@@ -17,7 +17,7 @@ from xew.metrics import (
     trajectory_error,
     trajectory_error_strict,
 )
-from xew.metrics.track import FAILURE, SIDE, TAPVID_SIDE, TOLERANCES, failure_distance
+from xew.metrics.track import FAILURE, PATHS_AT_ONCE, SIDE, TAPVID_SIDE, TOLERANCES, failure_distance, strict_warpings
 
 rng = np.random.default_rng(2)
 
@@ -124,6 +124,15 @@ def test_the_order_of_points_does_not_matter() -> None:
     for metric in (pck, pck_05, coverage, keypoint_error, ndtw, trajectory_error):
         shuffled = metric(prediction[:, order], target[:, order], valid[:, order])
         assert shuffled == pytest.approx(float(metric(prediction, target, valid)), rel=1e-6)
+
+
+def test_a_path_has_the_same_warping_whatever_paths_are_warped_with_it() -> None:
+    prediction, target, valid = tracks(t=30, k=2 * PATHS_AT_ONCE + 7)
+    together, counts = strict_warpings(prediction, target, valid)
+    assert counts.all() and np.unique(together).size == len(together)
+    for part in (np.s_[:PATHS_AT_ONCE], np.s_[PATHS_AT_ONCE - 5 : PATHS_AT_ONCE + 6], np.s_[-7:]):
+        alone, _ = strict_warpings(prediction[:, part], target[:, part], valid[:, part])
+        np.testing.assert_array_equal(alone, together[part])
 
 
 def test_errors_equal_their_definitions() -> None:

@@ -7,11 +7,12 @@ from functools import cached_property
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
-from xew.metrics.estimators.appearance import TrueAppearance
+from xew.metrics.estimators.appearance import REST, TrueAppearance
 from xew.metrics.metric import ACCELERATOR_CHUNK, fill_up
-from xew.metrics.perceptual import KEPT_FEATURES, SharedFeatures
+from xew.metrics.perceptual import KEPT_FEATURES, SMALLEST_SIDE, SharedFeatures
 from xew.metrics.truth import Truth
 
 FRAME_BLOCK = 4
@@ -21,11 +22,11 @@ WHOLE_BLOCK = 16
 """Number of frames that a video is filled up to a multiple of on a CPU for metrics that need all of it."""
 
 
-class GradedVideo:
-    """The graded frames of a video. A GPU gets them once for all metrics.
+class GradedFrames:
+    """The graded frames of a video or of masks. A GPU gets them once for all metrics.
 
     Args:
-        frames: [t h w 3] uint8.
+        frames: [t h w 3] uint8 or [t h w] bool.
     """
 
     def __init__(self, frames: np.ndarray) -> None:
@@ -35,14 +36,18 @@ class GradedVideo:
     def blocks(self, whole: bool) -> list[Any]:
         """`cut_blocks` of the frames, on the device."""
         if whole not in self._blocks:
-            blocks = cut_blocks(self.frames, whole)
-            self._blocks[whole] = blocks if is_on_cpu() else [jax.device_put(block) for block in blocks]
+            if is_on_cpu():
+                self._blocks[whole] = cut_blocks(self.frames, whole)
+            elif whole:
+                self._blocks[whole] = [jnp.concatenate(self.blocks(whole=False))]
+            else:
+                self._blocks[whole] = [jax.device_put(block) for block in cut_blocks(self.frames)]
         return self._blocks[whole]
 
 
 class EpisodeCache:
-    """An episode and what all predictions of it share: the graded frames of its true video, their LPIPS features, and its
-    appearance.
+    """An episode and what all predictions of it share: the graded frames of its true video and masks, their LPIPS features,
+    and its appearance.
 
     Args:
         truth: the episode.
@@ -51,8 +56,31 @@ class EpisodeCache:
 
     def __init__(self, truth: Truth, first: int = 1) -> None:
         self.truth, self.first = truth, first
-        self.target = GradedVideo(truth.rgb[first:])
+        self.target = GradedFrames(truth.rgb[first:])
         self.features = SharedFeatures(KEPT_FEATURES["cpu" if is_on_cpu() else "gpu"])
+
+    @cached_property
+    def region(self) -> GradedFrames | None:
+        """For each frame, all pixels that show the robot at any time; None where no frame shows it."""
+        mask = self.truth.mask[self.first :]
+        covered = np.any(mask, axis=0)
+        is_known = covered.any() and min(covered.shape) >= SMALLEST_SIDE
+        return GradedFrames(np.broadcast_to(covered, mask.shape)) if is_known else None
+
+    @cached_property
+    def robot(self) -> GradedFrames | None:
+        """The robot's masks, frame by frame; None where no frame shows the robot.
+
+        A frame without the robot gets all pixels that show it at any time, so a robot that is still shown there is an error.
+        """
+        mask = self.truth.mask[self.first :]
+        shown = mask.any(axis=(1, 2), keepdims=True)
+        return None if self.region is None else GradedFrames(np.where(shown, mask, self.region.frames))
+
+    @cached_property
+    def bodies(self) -> GradedFrames:
+        """The masks of the robot and of all objects, frame by frame."""
+        return GradedFrames(self.truth.labels[self.first :] != REST)
 
     @cached_property
     def appearance(self) -> TrueAppearance:

@@ -16,8 +16,8 @@ import numpy as np
 
 from xew.metrics import METRICS
 from xew.metrics.backends import Masker, Tracker
-from xew.metrics.episode_cache import EpisodeCache, GradedVideo, cut_blocks, is_on_cpu
-from xew.metrics.estimators.appearance import REST as SCENE
+from xew.metrics.episode_cache import EpisodeCache, GradedFrames, cut_blocks, is_on_cpu
+from xew.metrics.estimators.images import equal_frames
 from xew.metrics.estimators.presence import confirm_tracks
 from xew.metrics.metric import fill_up
 from xew.metrics.perceptual import SMALLEST_SIDE, Box, lpips, region_lpips_frames, robot_lpips_frames, union_box
@@ -28,6 +28,8 @@ TRACK_BLOCK, POINT_BLOCK = 64, 32
 programs: compiling one takes seconds, running it milliseconds."""
 ON_SURFACES = ("robot_points", "object_points")
 """Kinds of points that are tracked in one pass, by any tracker."""
+MASKED = ("region", "robot", "bodies")
+"""Kinds of inputs that are two videos and true masks."""
 JUDGED = tuple(sorted(OF_OUTCOME))
 """Kinds of inputs that rest on `Truth.outcome`, which asks for points on objects."""
 
@@ -74,9 +76,9 @@ class Comparison:
         return self.episode.truth
 
     @cached_property
-    def video(self) -> GradedVideo:
+    def video(self) -> GradedFrames:
         """The graded frames of the prediction."""
-        return GradedVideo(self.prediction[self.episode.first :])
+        return GradedFrames(self.prediction[self.episode.first :])
 
     def track_options(self, kind: str) -> dict[str, np.ndarray]:
         """The values of `metric.OPTIONS`, scalars, [t] and [k], for points of a kind, filled up as their tracks are."""
@@ -202,7 +204,7 @@ def grade(comparison: Comparison, metrics: Collection[str]) -> Grades:
             curves[name] = of_features[name] if name in of_features else _curve(comparison, name, arrays)
             values[name] = _mean_of_known(curves[name])
     prediction, target = _video(comparison)
-    return Grades(values, curves, int(np.all(prediction == target, axis=(1, 2, 3)).sum()))
+    return Grades(values, curves, int(equal_frames(prediction, target).sum()))
 
 
 Arrays = tuple[np.ndarray, ...]
@@ -217,30 +219,10 @@ def _mask(c: Comparison) -> Arrays:
     return c.estimate_masks()[c.episode.first :], c.truth.mask[c.episode.first :]
 
 
-def _region(c: Comparison) -> Arrays | None:
-    """The two videos and, for each frame, all pixels that show the robot at any time; None where no frame shows it."""
-    mask = c.truth.mask[c.episode.first :]
-    covered = np.any(mask, axis=0)
-    if not covered.any() or min(covered.shape) < SMALLEST_SIDE:
-        return None
-    return *_video(c), np.broadcast_to(covered, mask.shape)
-
-
-def _robot(c: Comparison) -> Arrays | None:
-    """The two videos and the robot's true masks, frame by frame; None where no frame shows the robot.
-
-    A frame without the robot gets all pixels that show it at any time, so a robot that is still shown there is an error.
-    """
-    region = _region(c)
-    if region is None:
-        return None
-    mask = c.truth.mask[c.episode.first :]
-    return *region[:2], np.where(mask.any(axis=(1, 2), keepdims=True), mask, region[2])
-
-
-def _bodies(c: Comparison) -> Arrays:
-    """The two videos and the true masks of the robot and of all objects, frame by frame."""
-    return *_video(c), c.truth.labels[c.episode.first :] != SCENE
+def _masked(kind: str, c: Comparison) -> Arrays | None:
+    """The two videos and the true masks of a kind, an attribute of `EpisodeCache`; None where the truth has none."""
+    masks: GradedFrames | None = getattr(c.episode, kind)
+    return None if masks is None else (*_video(c), masks.frames)
 
 
 def _tracks(kind: str, c: Comparison) -> Arrays | None:
@@ -285,9 +267,7 @@ def _others(count: int, own: int) -> np.ndarray:
 INPUTS: dict[str, Callable[[Comparison], Arrays | None]] = {
     "video": _video,
     "mask": _mask,
-    "region": _region,
-    "robot": _robot,
-    "bodies": _bodies,
+    **{kind: functools.partial(_masked, kind) for kind in MASKED},
     "outcome": _outcome,
     "variants": _variants,
     "variant_videos": _variant_videos,
@@ -303,15 +283,15 @@ def _curve(comparison: Comparison, name: str, arrays: Arrays) -> np.ndarray:
     if metric.inputs in ("mask", "outcome"):
         blocks = [cut_blocks(array, metric.whole) for array in arrays]
     else:
-        blocks = _video_blocks(comparison, arrays, metric.whole)
+        blocks = _video_blocks(comparison, metric.inputs, metric.whole)
     curves = [metric.curve(*parts) for parts in zip(*blocks, strict=True)]
     return np.concatenate(jax.device_get(curves))[: len(arrays[0])].astype(np.float32)
 
 
-def _video_blocks(comparison: Comparison, arrays: Arrays, whole: bool = False) -> list[list[Any]]:
-    """The two videos of a comparison, and the masks that follow them in the arrays, each in blocks."""
-    videos = comparison.video, comparison.episode.target
-    return [*(video.blocks(whole) for video in videos), *(cut_blocks(array, whole) for array in arrays[2:])]
+def _video_blocks(comparison: Comparison, kind: str, whole: bool = False) -> list[list[Any]]:
+    """The two videos of a comparison, and the true masks of a kind of input, each in blocks."""
+    masks = [getattr(comparison.episode, kind)] if kind in MASKED else []
+    return [frames.blocks(whole) for frames in (comparison.video, comparison.episode.target, *masks)]
 
 
 def _curves_of_features(comparison: Comparison, metrics: Collection[str], inputs: Inputs) -> dict[str, np.ndarray]:
@@ -320,7 +300,7 @@ def _curves_of_features(comparison: Comparison, metrics: Collection[str], inputs
     whole, robot, region = (by_function.get(curve) for curve in (lpips, robot_lpips_frames, region_lpips_frames))
     curves: dict[str, np.ndarray] = {}
     if whole or robot:
-        plain, weighted = _feature_distances(comparison, inputs["robot"] if robot else _video(comparison))
+        plain, weighted = _feature_distances(comparison, "robot" if robot else "video")
         curves |= {whole: plain} if whole else {}
         curves |= {robot: weighted} if robot and weighted is not None else {}
     arrays = inputs["region"] if region else None
@@ -329,17 +309,16 @@ def _curves_of_features(comparison: Comparison, metrics: Collection[str], inputs
             curves[region] = curves[whole]
         else:
             box = union_box(arrays[2][:1])  # of one frame, as all have these pixels: one program for all lengths
-            curves[region], _ = _feature_distances(comparison, arrays[:2], box)
+            curves[region], _ = _feature_distances(comparison, "video", box)
     return curves
 
 
-def _feature_distances(
-    comparison: Comparison, arrays: Arrays | None, box: Box | None = None
-) -> tuple[np.ndarray, np.ndarray | None]:
-    assert arrays is not None, "asked for what the truth has"
-    blocks = None if is_on_cpu() else _video_blocks(comparison, arrays)
-    prediction, target, *robot = arrays
-    return comparison.episode.features.distances(prediction, target, robot[0] if robot else None, box, blocks)
+def _feature_distances(comparison: Comparison, kind: str, box: Box | None = None) -> tuple[np.ndarray, np.ndarray | None]:
+    blocks = None if is_on_cpu() else _video_blocks(comparison, kind)
+    prediction, target = _video(comparison)
+    robot = comparison.episode.robot if kind == "robot" else None
+    masks = None if robot is None else robot.frames
+    return comparison.episode.features.distances(prediction, target, masks, box, blocks)
 
 
 def _touches_all_borders(mask: np.ndarray) -> bool:

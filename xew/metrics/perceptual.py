@@ -14,6 +14,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Bool
 
+from xew.metrics.estimators.images import equal_frames
 from xew.metrics.metric import (
     AnyArray,
     ByFrame,
@@ -208,7 +209,7 @@ class SharedFeatures:
         arrays = (prediction, target) if robot is None else (prediction, target, robot)
         blocks = [_frame_by_frame(array) for array in arrays] if blocks is None else blocks
         box = _whole_box(target) if box is None else box
-        equal = np.all(prediction == target, axis=(1, 2, 3))
+        equal = equal_frames(prediction, target)
         plain: list[Any] = []
         weighted: list[Any] = []
         layers: Layers | None = None
@@ -219,7 +220,7 @@ class SharedFeatures:
                 plain.append(np.zeros(len(frames), np.float32))
                 weighted.append(plain[-1])
                 continue
-            if layers is None or not np.array_equal(prediction[own], prediction[made_of]):
+            if layers is None or not _are_equal(prediction[own], prediction[made_of]):
                 layers, made_of = _layers(_weights(), frames, box), own
             true_layers = self._of_target(own.start, true, box)
             plain.append(_distance_of_layers(_weights(), layers, true_layers))
@@ -240,6 +241,10 @@ class SharedFeatures:
             if self._left >= 0:
                 self._true[key] = layers
         return layers
+
+
+def _are_equal(first: np.ndarray, second: np.ndarray) -> bool:
+    return len(first) == len(second) and bool(equal_frames(first, second).all())
 
 
 def _frame_by_frame(array: np.ndarray) -> list[np.ndarray]:

@@ -34,6 +34,9 @@ SIDE = math.sqrt(320 * 240)
 """Side [pixels] of the square with the area of an episode's image."""
 LARGEST = math.hypot(320, 240)
 """Diagonal [pixels] of an episode's image: no two points in it are farther apart."""
+PATHS_AT_ONCE = 32
+"""Number of paths that are warped at once on a CPU. XLA divides the steps of more among all cores, which takes longer than the
+steps themselves."""
 
 
 @check_first(check_tracks)
@@ -326,15 +329,19 @@ def _path_costs(prediction: AnyArray, target: AnyArray, tracked: AnyArray, most:
     """`_path_cost` [k] of each of k paths [t k 2]; 0 where there is no frame."""
     if 0 in tracked.shape:
         return jnp.zeros(tracked.shape[1], jnp.float32)
-    return jax.vmap(functools.partial(_path_cost, most=most), in_axes=1)(prediction, target, tracked)
+    paths = tuple(jnp.moveaxis(array, 1, 0) for array in (prediction, target, tracked))
+    device = jax.config.jax_default_device or jax.devices()[0]  # type: ignore[attr-defined]
+    on_cpu = getattr(device, "platform", device) == "cpu"
+    return lax.map(functools.partial(_path_cost, most=most), paths, batch_size=PATHS_AT_ONCE if on_cpu else len(paths[0]))
 
 
-def _path_cost(prediction: AnyArray, target: AnyArray, tracked: AnyArray, most: jax.Array) -> jax.Array:
+def _path_cost(paths: tuple[AnyArray, AnyArray, AnyArray], most: jax.Array) -> jax.Array:
     """DTW cost of two paths [t 2] over the tracked frames; a step costs at most `most`, and a lost place costs `most`.
 
     Tracked frames come first, so the cost is the cell (n - 1, n - 1) of the table, which no later frame touches. Cells of an
     anti-diagonal do not depend on each other.
     """
+    prediction, target, tracked = paths
     order = jnp.argsort(~tracked, stable=True)
     keep = tracked[order][:, None]
     a, b = (jnp.where(keep, _in_float32(path)[order], 0) for path in (prediction, target))

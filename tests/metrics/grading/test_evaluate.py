@@ -288,8 +288,8 @@ def test_on_a_gpu_a_video_is_put_once_for_all_metrics_and_the_truth_once_for_all
     data: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = episode_folder(data, TASK, SEED, "piper")
-    names = ("psnr", "ssim", "lpips", "robot_lpips")
-    read = read_truth(folder, FRAMES, {"video", "robot"})
+    names = ("psnr", "ssim", "lpips", "robot_lpips", "flicker", "flicker_robot", "ghosts")
+    read = read_truth(folder, FRAMES, {"video", "robot", "bodies"})
     videos = late(read.rgb), late(late(read.rgb))
     episode = EpisodeCache(read)
     expected = [grade_one(Comparison(video, episode, estimate_masks, exact), names).values for video in videos]
@@ -301,11 +301,12 @@ def test_on_a_gpu_a_video_is_put_once_for_all_metrics_and_the_truth_once_for_all
     monkeypatch.setattr(jax, "device_put", lambda array: put.append(array.shape) or on_device(array))
     monkeypatch.setattr(perceptual, "_layers", lambda *given: passes.append(True) or layers(*given))
     episode = EpisodeCache(read)
-    for video, values, puts, through in zip(videos, expected, (2, 1), (2, 1), strict=True):
+    for video, values, puts, masks, through in zip(videos, expected, (2, 1), (2, 0), (2, 1), strict=True):
         put.clear()
         passes.clear()
         assert grade_one(Comparison(video, episode, estimate_masks, exact), names).values == pytest.approx(values, rel=1e-4)
         assert len([shape for shape in put if len(shape) == 4]) == puts
+        assert len([shape for shape in put if len(shape) == 3]) == masks, "of the robot and of all bodies"
         assert len(passes) == through, "through LPIPS's network, for two metrics"
 
 

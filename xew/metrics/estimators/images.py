@@ -14,6 +14,12 @@ def soften(image: np.ndarray, sigma: float) -> np.ndarray:
     return cv2.GaussianBlur(image, (0, 0), sigma)
 
 
+def equal_frames(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """[t] bool, which frames of two videos [t h w 3] are equal. Most that are not differ in their first row."""
+    pairs = zip(first, second, strict=True)
+    return np.array([np.array_equal(a[0], b[0]) and np.array_equal(a, b) for a, b in pairs], bool)
+
+
 def is_inside(points: np.ndarray, image: np.ndarray) -> np.ndarray:
     """[...] bool, is each point [... 2] in a pixel of the image?"""
     height, width = image.shape[:2]

@@ -11,6 +11,7 @@ from xew.metrics.estimators import masks as reference
 from xew.metrics.estimators.batched import mask_kernels as kernels
 from xew.metrics.estimators.batched.devices import download
 from xew.metrics.estimators.batched.flow import Array, Search, build_pyramid, find_flow, is_large_enough
+from xew.metrics.estimators.images import equal_frames
 from xew.metrics.estimators.similarity import find_most_similar
 
 SEARCH = Search(finest=1, stride=4, steps=16)
@@ -113,11 +114,8 @@ class _Plan:
 
 
 def _plan(prediction: np.ndarray, alike: np.ndarray) -> _Plan:
-    first_alike = np.arange(len(prediction))
-    for t in range(1, len(prediction)):
-        if np.array_equal(prediction[t], prediction[t - 1]):
-            first_alike[t] = first_alike[t - 1]
-    return _Plan(first_alike, alike)
+    changes = np.append(True, ~equal_frames(prediction[1:], prediction[:-1]))
+    return _Plan(np.maximum.accumulate(np.where(changes, np.arange(len(prediction)), 0)), alike)
 
 
 def _estimate(prediction: Array, known: _Episode, plan: _Plan) -> Array:
