@@ -79,14 +79,15 @@ class CommandVariants:
     def find_shown(self, video: np.ndarray) -> Variant | None:
         """The variant whose objects end where a video [t h w 3] uint8 shows them; None if it shows them at no variant's places.
 
-        It is the one with the most similar last frame, by squared differences of color in moving regions. Each object that it
-        has moved must be seen, and most of these pixels must have the same color in the video.
+        It is the one with the most similar last frame, by squared differences of color in moving regions. Each object that
+        moves under any variant must be seen where this one has it: most of these pixels must have the same color in the video.
         """
         region, end = self.moving[-1], _soften(video[self.frames - 1])
         differences = [end - _soften(variant.rgb[-1]) for variant in self.variants]
         nearest = int(np.argmin([np.square(difference[region]).sum() for difference in differences]))
         variant, same = self.variants[nearest], np.abs(differences[nearest]).max(axis=-1) <= OTHER_COLOR
-        places = [region & (variant.shown[-1] == body) for body in np.flatnonzero(variant.moved)]
+        moved = np.any([other.moved for other in self.variants], axis=0)
+        places = [region & (variant.shown[-1] == body) for body in np.flatnonzero(moved)]
         is_shown = all(place.sum() >= LEAST_SEEN and same[place].mean() >= MOST for place in places)
         return variant if region.any() and is_shown else None
 
