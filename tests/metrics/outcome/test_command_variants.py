@@ -1,5 +1,7 @@
 """Command variants of a scene: they are read once, and their moving regions are compared by LPIPS."""
 
+import json
+import shutil
 from collections import Counter
 from pathlib import Path
 
@@ -52,6 +54,18 @@ def test_states_of_a_scene_are_read_twice_however_many_videos_are_graded(
     for name in names:
         assert means[name, GROUND_TRUTH] == 1
         assert means[name, COPY_FIRST_FRAME] == pytest.approx(1 / len(SEEDS)), "it always looks like the same variant"
+
+
+def test_a_command_that_another_robot_refused_is_no_variant(data: Path, tmp_path: Path) -> None:
+    """Such a cell has a record without hashes, and no states."""
+    copied = Path(shutil.copytree(data, tmp_path / "data"))
+    refused = episode_folder(copied, TASK, SEEDS[-1], "piper")
+    header = json.loads((refused / "episode.json").read_text("utf-8")) | {"files": {}, "hashes": {}}
+    shutil.rmtree(refused)
+    refused.mkdir()
+    (refused / "episode.json").write_text(json.dumps(header), "utf-8")
+    found, _ = find(copied, 1)
+    assert found.folders == tuple(episode_folder(copied, TASK, seed, "piper") for seed in SEEDS[:-1])
 
 
 def test_variants_of_a_scene_are_graded_after_one_another(data: Path) -> None:

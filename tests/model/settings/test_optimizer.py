@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from xew.model.settings.checks import LONGEST_AVERAGE
-from xew.model.settings.optimizer import RMS_OF_ADAM, average_decay, find_matrices, make_optimizer
+from xew.model.settings.optimizer import ADAM_SHARE, RMS_OF_ADAM, average_decay, find_matrices, make_optimizer
 from xew.model.settings.settings import TrainSettings
 
 SHAPES = {
@@ -46,6 +46,22 @@ def test_updates_of_muon_are_near_orthogonal_and_as_large_as_those_of_adamw(para
         values = np.linalg.svd(update, compute_uv=False)
         assert values.min() > 0.5 * values.max()
         assert np.sqrt(np.square(update).mean()) == pytest.approx(RMS_OF_ADAM, rel=0.3)
+
+
+def test_a_burst_of_gradients_makes_no_large_steps_beside_muon(params: dict) -> None:
+    """Gradients ten times as large as 1,000 before move AdamW's parameters by little more than their learning rate."""
+    settings = TrainSettings(steps=2000, warmup_steps=0, learning_rate=1.0, decay_to=1, mu_dtype="float32")
+    optimizer, gradient = make_optimizer(settings), jax.tree.map(lambda leaf: 1e-3 * jnp.ones_like(leaf), params)
+    step = jax.jit(lambda gradient, state: optimizer.update(gradient, state, jax.tree.map(jnp.zeros_like, params)))
+    state = optimizer.init(params)
+    for _ in range(1000):
+        update, state = step(gradient, state)
+    assert np.asarray(update["head"]["kernel"]) == pytest.approx(-ADAM_SHARE, rel=1e-3)
+    moved = []
+    for _ in range(20):
+        update, state = step(jax.tree.map(lambda leaf: 10 * leaf, gradient), state)
+        moved.append(float(jnp.abs(update["head"]["kernel"]).max()))
+    assert max(moved) < 1.3 * ADAM_SHARE
 
 
 def test_muon_computes_in_the_type_of_its_moments(params: dict) -> None:
