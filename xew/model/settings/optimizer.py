@@ -31,13 +31,13 @@ def learning_rate(settings: TrainSettings) -> optax.Schedule:
 
 
 RMS_OF_ADAM = 0.2
-"""Root mean square of Muon's updates relative to the learning rate, as of AdamW's (Moonlight, Liu et al. 2025, arXiv:2502.16982,
-equation 4)."""
+"""Root mean square of Muon's updates relative to the learning rate, as of AdamW's (Moonlight, Liu et al. 2025,
+arXiv:2502.16982, equation 4)."""
 ADAM_SHARE = 0.25
-"""Learning rate of AdamW's parameters beside Muon, relative to Muon's. With equal rates and optax's second moments of 1,000 steps
-the loss of runs on 25 tasks jumped back to its start (docs/results/all_tasks)."""
+"""Learning rate of AdamW's parameters beside Muon, relative to Muon's. At equal rates, with second moments of 1,000 steps, the
+loss on 25 tasks jumped back to where it began in two of two runs (docs/results/all_tasks)."""
 ADAM_B2 = 0.95
-"""Decay of AdamW's second moments beside Muon: the last 20 steps, so a burst of gradients makes no larger steps than others."""
+"""Decay of AdamW's second moments beside Muon: they reach over 20 steps, so a burst of gradients makes no large steps."""
 
 
 def make_optimizer(settings: TrainSettings) -> optax.GradientTransformation:
