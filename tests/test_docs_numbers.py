@@ -50,7 +50,8 @@ def test_the_recipe() -> None:
     train = load_experiment(FIXED).train
     row = f"| `configs/fixed.yaml`, {train.steps:,} steps of {train.batch} clips, with compiling | 1 H200 | 8 min 34 s |"
     assert row in page("train_on_many_gpus")
-    assert "8 minutes 34 s on one H200" in header(FIXED) and "0.16 s a step" in header(FIXED)
+    assert "| the same, 25 tasks, 4,800 steps | 1 H200 | 11 min 55 s |" in page("train_on_many_gpus")
+    assert "4,800 steps with starting and compiling 11 minutes 55 s on one H200" in header(FIXED)
     assert f"| 8 min 34 s | the same, the recommended length | 0.025 / 0.047 / 0.057 | {train.steps:,} steps" in page(
         "speedrun"
     )
