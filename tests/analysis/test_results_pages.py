@@ -122,7 +122,8 @@ def test_the_recommended_recipe_on_all_tasks(label: str) -> None:
 def test_each_task_of_the_recommended_recipe() -> None:
     """Tasks are in the order of LPIPS on training robots."""
     rows = read_scores(RESULTS / "all_tasks" / "scores.parquet").rows
-    own, shown = rows[rows["model"].isin(["fixed", "fixed_1"])], [cells for cells in read_rows("all_tasks") if cells[0].startswith("`")]
+    own = rows[rows["model"].isin(["fixed", "fixed_1"])]
+    shown = [cells for cells in read_rows("all_tasks") if cells[0].startswith("`")]
     for cells in shown:
         of_task = own[own["task"] == cells[0].strip("`")]
         for cell, metric in zip(cells[1:], ("lpips", "trajectory_error_strict"), strict=True):
