@@ -87,7 +87,7 @@ def test_the_smallest_pieces_launch_all_that_episodes_do(
     ("cached", "parts"),
     [
         ([], [("physics", "cpu"), ("kinematics", "cpu"), ("rendering", "cuda:0")]),
-        (["wp_xew.sim_warp.rendering.raster_kernels_1/a.sm90.cubin"], [("physics", "cpu"), ("kinematics", "cpu")]),
+        (["wp_xew.sim_warp.rendering.shading_kernels_1/a.sm90.cubin"], [("physics", "cpu"), ("kinematics", "cpu")]),
         (
             ["wp_newton._src.solvers.mujoco.kernels_1/a.sm90.cubin", "wp__lm_solve_tiled_7_20_1/a.cpu.o"],
             [("physics", "cpu"), ("rendering", "cuda:0")],

@@ -76,16 +76,10 @@ def test_a_gpu_gets_as_many_whole_scenes_as_it_steps_worlds() -> None:
 
 @pytest.mark.parametrize(
     ("scenes", "workers", "sizes"),
-    [
-        (1, 1, [1, 1]),
-        (5, 1, [2, 2, 2, 2, 1, 1]),
-        (5, 8, [1] * 10),
-        (40, 1, [2, 2, 16, 16, 16, 16, 6, 6]),
-        (40, 3, [2] * 4 + [6] * 12),
-    ],
+    [(1, 1, [1, 1]), (5, 1, [2, 2, 2, 2, 1, 1]), (5, 8, [1] * 10), (40, 1, [16, 16, 16, 16, 8, 8]), (40, 2, [10] * 8)],
 )
 def test_a_core_gets_one_robot_of_a_few_scenes(scenes: int, workers: int, sizes: list[int]) -> None:
-    """At least four shares for each worker end at about the same time; small first ones give an episode early."""
+    """There are at least four shares for each worker, so all end at about the same time."""
     jobs = [Job(TASK, seed, ROBOTS) for seed in range(scenes)]
     shares = PRODUCTION.shares(jobs, workers)
     assert [len(share) for share in shares] == sizes

@@ -12,8 +12,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
-from itertools import chain, islice, repeat
-from math import ceil
 from pathlib import Path
 
 import warp as wp
@@ -28,8 +26,6 @@ from xew.sim_warp.robots import ROBOTS, RobotSpec
 
 PLANNED_TOGETHER = 16
 """Largest number of scenes in a CPU's share. Inverse kinematics of 16 paths together takes a fifth of the time."""
-PLANNED_FIRST = 2
-"""Largest number of scenes in each worker's first share on a CPU: the first episode waits for few plans."""
 SHARES_PER_WORKER = 4
 """Least number of a CPU's shares for each worker, so all workers end at about the same time."""
 BATCHES_PER_GPU = 3
@@ -63,9 +59,7 @@ class Production:
         if not self.gpu_physics:
             cells = sum(len(job.robots) for job in jobs)
             size = max(1, min(PLANNED_TOGETHER, cells // (SHARES_PER_WORKER * workers)))
-            sizes = chain(repeat(min(size, PLANNED_FIRST), ceil(workers * len(jobs) / cells)), repeat(size))
-            remaining = iter(jobs)
-            groups = iter(lambda: list(islice(remaining, next(sizes))), [])
+            groups = [jobs[first : first + size] for first in range(0, len(jobs), size)]
             return [share for group in groups for share in _share_by_robot(group)]
         shares: list[list[Job]] = []
         worlds = self.batch

@@ -11,13 +11,12 @@ import numpy as np
 import warp as wp
 from tqdm import tqdm
 
-from xew.sim_warp.devices.kernels import DEFAULT_BLOCK, compile_together, has_kernels
+from xew.sim_warp.devices.kernels import has_kernels
 from xew.sim_warp.devices.workers import Workers
 from xew.sim_warp.embodiment.spec import RobotSpec
 from xew.sim_warp.kinematics.forward import tool_pose
 from xew.sim_warp.kinematics.inverse import arm_solver
 from xew.sim_warp.physics import World, simulate
-from xew.sim_warp.rendering import raster_kernels, shading_kernels
 from xew.sim_warp.rendering.observe import Recording, observe
 from xew.sim_warp.rendering.render import Renderer
 from xew.sim_warp.rendering.streams import home_action
@@ -28,9 +27,9 @@ from xew.sim_warp.tasks import TASKS
 PARTS = {
     "physics": "newton._src.solvers.mujoco.kernels",
     "kinematics": "_lm_solve_tiled",
-    "rendering": "xew.sim_warp.rendering.raster_kernels",
+    "rendering": "xew.sim_warp.rendering.shading_kernels",
 }
-"""Parts of the work, by decreasing compile time on a GPU, and a module that each needs; of rendering the slowest."""
+"""Parts of the work, by decreasing compile time on a GPU, and a module of kernels that each needs."""
 ROBOT, TASK = "franka_panda", "open_laptop"
 """Robot and task of the smallest jobs; kernels serve all robots and tasks."""
 
@@ -91,8 +90,6 @@ def _simulate(robot: RobotSpec, device: wp.Device, batch: int) -> None:
 
 
 def _render(robot: RobotSpec, device: wp.Device, batch: int) -> None:
-    modules = [wp.get_module(kernels.__name__) for kernels in (raster_kernels, shading_kernels)]
-    compile_together([(module, DEFAULT_BLOCK) for module in modules], device)
     observe(Renderer(device.alias), [Recording(robot, stand_at_home(robot, 1))])
 
 
