@@ -423,6 +423,12 @@ def test_gpus_have_as_many_workers_as_cores_and_their_memory_allow(
     assert workers.worker_count(cast(Any, gpus), cast(Any, stepping)) == count
 
 
+def test_a_gpu_that_others_fill_is_refused() -> None:
+    gpus = [SimpleNamespace(is_cuda=True, alias=f"cuda:{number}", total_memory=size) for number, size in enumerate([80e9, 0])]
+    with pytest.raises(ConfigError, match="^cuda:1 has no memory left; end the programs"):
+        workers.worker_count(cast(Any, gpus))
+
+
 def test_physics_on_a_gpu_that_is_not_there_is_refused() -> None:
     devices = [wp.get_device("cpu")]
     with pytest.raises(ConfigError, match="--physics cuda needs a GPU, and the device is cpu; omit it"):

@@ -75,10 +75,15 @@ def worker_count(devices: Sequence[warp.Device], physics: warp.Device | None = N
     Args:
         devices: devices for rendering, all of one kind.
         physics: another device for planning and physics, if any. CPU physics takes a core per process and less GPU memory.
+
+    Raises:
+        ConfigError: a GPU has no memory left.
     """
     cores = usable_cores()
     if not devices[0].is_cuda:
         return cores
+    if full := [device.alias for device in devices if not device.total_memory]:  # CUDA cannot even open it
+        raise ConfigError(f"{full[0]} has no memory left; end the programs that use it, or name another with --device.")
     only_render = physics is not None and not physics.is_cuda
     wanted, memory = (cores, MEMORY_PER_RENDERING_WORKER) if only_render else (cores // 2, MEMORY_PER_WORKER)
     return max(1, min(wanted, sum(int(device.total_memory // memory) for device in devices)))
