@@ -45,8 +45,7 @@ class Dataset:
     @cached_property
     def accepted(self) -> tuple[Episode, ...]:
         """Episodes of seeds on which no robot was refused: the paired data set. Raises EpisodeError if there is none."""
-        # After a failure the other robots have no videos, even if the run stopped before it wrote the failed cell.
-        failed = {(record.task, record.seed) for _, record in self.cells if not record.is_kept or not record.hashes}
+        failed = {(record.task, record.seed) for _, record in self.cells if not record.is_recorded}
         accepted = tuple((folder, record) for folder, record in self.cells if (record.task, record.seed) not in failed)
         if not accepted:
             raise explain_missing(self.root, "accepted episode")

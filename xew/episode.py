@@ -170,6 +170,11 @@ class Record:
         """Whether it is an episode and not a refused cell: an expert's success, or what physics made of a fault."""
         return self.failure is None if self.fault else self.success
 
+    @property
+    def is_recorded(self) -> bool:
+        """Whether its states and hashes exist: a kept cell has none where another robot's failure came first."""
+        return self.is_kept and bool(self.hashes)
+
 
 def episode_folder(data: Path, task: str, seed: int, robot: str) -> Path:
     """The folder of an episode in a data set or in a tree of the same form.

@@ -87,7 +87,7 @@ def find_other_robot(folder: Path, record: Record) -> Episode | None:
     place = names.index(folder.name)
     for name in names[place + 1 :] + names[:place]:
         candidate = read_record(folder.parent / name)
-        if candidate.is_kept and candidate.videos and candidate.scene_hash == record.scene_hash:
+        if candidate.is_recorded and candidate.videos and candidate.scene_hash == record.scene_hash:
             return folder.parent / name, candidate
     return None
 

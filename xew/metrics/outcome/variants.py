@@ -127,12 +127,11 @@ def find_variants(folder: Path, record: Record, frames: int, surfaces: Path | No
     seeds = sorted(int(path.name) for path in folder.parents[1].iterdir() if path.name.isdigit())
     folders = [episode_folder(data, record.task, seed, record.robot) for seed in seeds if split_fault(seed)[1] == base]
     records = {path: read_record(path) for path in folders if (path / "episode.json").exists()}
-    # Where a command was refused with another robot, the record has no hashes, because no video was made.
-    kept = {path: str(record.hashes) for path, record in records.items() if record.is_kept and record.hashes}
-    if len(kept) < 2:
+    recorded = {path: str(record.hashes) for path, record in records.items() if record.is_recorded}
+    if len(recorded) < 2:
         return None, 0
-    own = next(number for number, path in enumerate(kept) if path.samefile(folder))
-    return _open_variants(tuple(kept), tuple(kept.values()), frames, surfaces), own
+    own = next(number for number, path in enumerate(recorded) if path.samefile(folder))
+    return _open_variants(tuple(recorded), tuple(recorded.values()), frames, surfaces), own
 
 
 def _soften(frame: np.ndarray) -> np.ndarray:
