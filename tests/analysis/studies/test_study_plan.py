@@ -120,7 +120,9 @@ def test_the_final_study_makes_predicts_and_grades_seeds_that_nobody_has_looked_
     assert "--test-seeds 1" in " ".join(usual["generate"].command) and "final" not in str(usual)
     assert step_key(final["generate"], []) != step_key(usual["generate"], [])
     monkeypatch.setattr("xew.analysis.study.check_configs", lambda paths: None)
-    for family, says in (("test", "seeds from 1,000,000"), ("final", "seeds from 2,000,000")):
+    trial = plan(replace(study, test_family="validation"))["generate"].command
+    assert " ".join(trial).endswith("--train-seeds 1 --test-seeds 0 --validation-seeds 1")
+    for family, says in (("test", "from 1,000,000"), ("validation", "from 800,000"), ("final", "from 2,000,000")):
         main(["configs/study_debug.yaml", "--dry-run", "--test-family", family, "--out", str(tmp_path / family)])
         assert says in capsys.readouterr().out
 

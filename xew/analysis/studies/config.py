@@ -117,7 +117,7 @@ class Study:
     test_seeds: int = TEST_SEEDS_PER_TASK
     """Number of test seeds of each task."""
     test_family: str = "test"
-    """Family of the test seeds; final: the block that is reserved for the final study, which nobody has looked at."""
+    """Family of the test seeds. validation: for trials; final: the block reserved for the final study, which nobody has looked at."""
     training_seeds: tuple[int, ...] = ()
     """Seeds of every variant's training runs; one run with the experiment's seed where left out."""
     repeated: tuple[str, ...] = ("*",)
@@ -304,7 +304,7 @@ def _check_names(study: Study, path: Path) -> None:
         ("number of shots", shots, known_shots),
         ("kind of motion", (study.motion,), MOTIONS),
         ("change of scenes", study.changes, SHIFTS),
-        ("family of test seeds", (study.test_family,), ("test", "final")),
+        ("family of test seeds", (study.test_family,), ("test", "validation", "final")),
         ("task", study.tasks, study.tasks),  # known: checked above, and may be outside tasks
         ("training seed", tuple(map(str, study.training_seeds)), tuple(map(str, study.training_seeds))),
         ("kind of step in step_environment", tuple(study.step_environment), KINDS),
