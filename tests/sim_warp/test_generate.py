@@ -425,7 +425,7 @@ def test_gpus_have_as_many_workers_as_cores_and_their_memory_allow(
 
 def test_a_gpu_that_others_fill_is_refused() -> None:
     gpus = [SimpleNamespace(is_cuda=True, alias=f"cuda:{number}", total_memory=size) for number, size in enumerate([80e9, 0])]
-    with pytest.raises(ConfigError, match="^cuda:1 has no memory left; end the programs"):
+    with pytest.raises(ConfigError, match=r"^cuda:1 has no memory left; end the programs"):
         workers.worker_count(cast(Any, gpus))
 
 

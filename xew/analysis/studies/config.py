@@ -117,7 +117,7 @@ class Study:
     test_seeds: int = TEST_SEEDS_PER_TASK
     """Number of test seeds of each task."""
     test_family: str = "test"
-    """Family of the test seeds. validation: for trials; final: the block reserved for the final study, which nobody has looked at."""
+    """Family of the test seeds; validation: for trials; final: the block of the final study, which nobody has looked at."""
     training_seeds: tuple[int, ...] = ()
     """Seeds of every variant's training runs; one run with the experiment's seed where left out."""
     repeated: tuple[str, ...] = ("*",)
