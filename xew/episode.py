@@ -29,7 +29,6 @@ from pathlib import Path
 from typing import Any
 
 import av
-import cv2
 import numpy as np
 
 from xew.concurrency import PARSING
@@ -508,11 +507,6 @@ def write_video(path: Path, video: np.ndarray, frame_rate: float = FRAME_RATE) -
         for frame in np.ascontiguousarray(video):
             container.mux(stream.encode(av.VideoFrame.from_numpy_buffer(frame, format="rgb24")))
         container.mux(stream.encode())
-
-
-def encode_png(image: np.ndarray) -> bytes:
-    """The PNG file of an RGB image [h w 3] uint8."""
-    return cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].tobytes()
 
 
 def open_video(path: Path | LoadedFile) -> Any:

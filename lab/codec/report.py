@@ -21,7 +21,6 @@ from lab.codec.pictures import ALIGNED, differs_from_corner, draw_descriptions, 
 from lab.codec.settings import CodecExperiment
 from lab.codec.unpaired import select_unpaired
 from xew.dataset import Dataset, Episode
-from xew.episode import encode_png
 from xew.files import write_bytes, write_text
 from xew.model.codecs.ceiling import LPIPS_EVERY, choose_evenly, reconstruct
 from xew.model.codecs.contract import Codec
@@ -29,6 +28,7 @@ from xew.model.settings.settings import Clip
 from xew.model.video.comparison import strip
 from xew.model.video.frames import TEMPORAL_FACTOR
 from xew.protocol import expand_robots
+from xew.sim_warp.inspection.pictures import encode_png
 
 
 @dataclass(frozen=True)

@@ -19,11 +19,12 @@ import numpy as np
 import tyro
 
 from xew.config import user_errors
-from xew.episode import encode_png, write_video
+from xew.episode import write_video
 from xew.files import hold_lock, replacing, write_bytes
 from xew.protocol import expand_robots
 from xew.sim_warp.devices.workers import quiet_warp
 from xew.sim_warp.geometry.camera import HEAD_CAMERA
+from xew.sim_warp.inspection.pictures import encode_png
 from xew.sim_warp.rendering.bodies import robot_bodies, robot_pose
 from xew.sim_warp.rendering.render import Renderer
 from xew.sim_warp.rendering.streams import (

@@ -11,7 +11,7 @@ from PIL import Image
 from tqdm import tqdm
 
 from xew.dataset import view_episode
-from xew.episode import HEIGHT, WIDTH, EpisodeError, Record, encode_png, read_pixels, read_record, read_states
+from xew.episode import HEIGHT, WIDTH, EpisodeError, Record, read_pixels, read_record, read_states
 from xew.files import replacing, write_bytes
 from xew.names import folder_name, path_below
 from xew.protocol import HEAD
@@ -175,6 +175,11 @@ def tile(rows: list[list[np.ndarray]]) -> np.ndarray:
     """Rows of equal pictures [h w 3] uint8 as one picture with white gaps."""
     padded = [[np.pad(image, ((0, GAP), (0, GAP), (0, 0)), constant_values=255) for image in row] for row in rows]
     return np.concatenate([np.concatenate(row, 1) for row in padded])
+
+
+def encode_png(image: np.ndarray) -> bytes:
+    """The PNG file of an RGB image [h w 3] uint8."""
+    return cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].tobytes()
 
 
 def save_png(path: Path, image: np.ndarray) -> None:

@@ -25,11 +25,11 @@ import tyro
 from tqdm import tqdm
 
 from xew.config import ConfigError, user_errors
-from xew.episode import encode_png
 from xew.files import hold_lock, write_bytes
 from xew.names import plain_line
 from xew.sim_warp.devices.workers import quiet_warp
 from xew.sim_warp.embodiment.urdf import Urdf, load_urdf
+from xew.sim_warp.inspection.pictures import encode_png
 from xew.sim_warp.kinematics.reachability import work_reach
 from xew.sim_warp.rendering.streams import nine_views
 from xew.sim_warp.robots import ROBOTS
