@@ -152,9 +152,10 @@ def test_a_study_of_bodies_makes_what_its_variants_ask_for() -> None:
     command = steps["generate"].command
     trained, tested = command[command.index("--robots") + 1 :], command[command.index("--test-robots") + 1 :]
     assert (trained[:18], tested[:12]) == (study.trained_robots, study.graded_robots)
-    trial = plan(replace(study, test_family="validation"))["generate"].command
-    assert trial[trial.index("--robots") + 1 :][:28] == study.trained_robots + study.graded_robots[2:]
-    assert "--test-robots" not in trial
+    trial = replace(study, test_family="validation")
+    made = plan(trial)["generate"].command
+    assert made[made.index("--robots") + 1 :][:28] == trial.trained_robots == study.trained_robots + study.graded_robots[2:]
+    assert estimate(trial, plan(trial))["generate"].amount == 6 * (10 * 28 + 2 * 12)
     first, last = study.planned_variants[0], study.planned_variants[-1]
     assert study.graded_counts(first) == dict.fromkeys(study.graded_robots, 12)
     assert study.graded_counts(last) == dict.fromkeys(study.graded_robots[:4], 12), "one model alone is asked for distances"

@@ -188,6 +188,8 @@ class Study:
     def trained_robots(self) -> tuple[str, ...]:
         """Robots that have training episodes: of the five all, so parts may be added; bodies that a variant trains on."""
         asked = {robot for variant in self.planned_variants for robot in SPLITS[variant.split].train_robots}
+        if self.test_family == "validation":  # whose scenes `generate` makes with the robots of training scenes
+            asked |= set(self.graded_robots)
         return tuple(robot for robot in self.robot_keys if robot in ROBOT_NAMES or robot in asked)
 
     @property

@@ -162,10 +162,7 @@ def _rollouts_path(study: Study, variant: str) -> Path:
 def _plan_generate(study: Study) -> Step:
     counts = {"train": study.train_seeds, study.test_family: study.test_seeds}
     motion = () if study.motion == SHARED_MOTION else ("--motion", study.motion)
-    teams = study.trained_robots, study.graded_robots
-    if study.test_family == "validation":  # whose scenes `generate` makes with the training robots
-        teams = (tuple(dict.fromkeys(teams[0] + teams[1])),) * 2
-    robots = dict.fromkeys(teams)  # once where all are both trained on and graded
+    robots = dict.fromkeys((study.trained_robots, study.graded_robots))  # once where all are both trained on and graded
     named = tuple(text for option, keys in zip(("--robots", "--test-robots"), robots, strict=False) for text in (option, *keys))
     return Step(
         "generate",
