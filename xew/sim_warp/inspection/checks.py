@@ -29,11 +29,7 @@ EPISODES_PER_WORKER = 32
 
 def verify(folders: list[Path]) -> list[str]:
     """Compare all files with their hashes and check motions for plausibility; returns the error messages."""
-    with Workers(min(usable_cores(), len(folders) // EPISODES_PER_WORKER), imported=(__name__,)) as workers:
-        several = len(folders) >= 2 * EPISODES_PER_WORKER
-        results = workers.run(find_problem, folders) if several else map(find_problem, folders)
-        bar = tqdm(results, desc="verifying", unit="episode", total=len(folders))
-        damaged = sorted(problem for problem in bar if problem)
+    damaged = sorted(filter(None, _on_cores(find_problem, folders, "verifying")))
     print(f"{len(folders) - len(damaged)} of {len(folders)} episodes agree with their hashes and are plausible")
     return damaged
 
@@ -77,8 +73,16 @@ def render_views(cells: Sequence[Episode], specs: Sequence[CameraSpec]) -> None:
 
 def tile_views(cells: Sequence[Episode], views: Sequence[str]) -> None:
     """Make and store the view that tiles others into one picture. Raises EpisodeError as `add_tiled`."""
-    made = [add_tiled(folder, views) for folder, _ in tqdm(cells, desc="tiling", unit="episode")]
+    made = _on_cores(partial(add_tiled, views=views), [folder for folder, _ in cells], "tiling")
     print(f"view {'+'.join(views)}: {sum(made)} of {len(cells)} episodes new")
+
+
+def _on_cores(function: Callable[[Path], Result], folders: list[Path], doing: str) -> list[Result]:
+    """Results of episodes in any order, from as many processes as there are cores if there are many episodes, else from here."""
+    with Workers(min(usable_cores(), len(folders) // EPISODES_PER_WORKER), imported=(__name__,)) as workers:
+        several = len(folders) >= 2 * EPISODES_PER_WORKER
+        results = workers.run(function, folders) if several else map(function, folders)
+        return list(tqdm(results, desc=doing, unit="episode", total=len(folders)))
 
 
 def _render_all(render: Callable[[Path], Result], folders: list[Path]) -> list[Result]:
