@@ -31,8 +31,10 @@ from xew.model.conditions import (
     tool_poses,
 )
 from xew.model.episodes.commands import episode_command
-from xew.protocol import ACTION_DIM, ROBOT_NAMES
+from xew.protocol import ACTION_DIM, ROBOT_NAMES, Change
+from xew.sim_warp.changes.scenes import raised_by
 from xew.sim_warp.geometry.camera import look_at
+from xew.sim_warp.rendering.streams import three_shadows
 from xew.sim_warp.robots import ROBOTS, keep_robot
 
 STORED = [condition for condition in (ACTIONS["joints"], CONDITIONS["robot_render"]) if isinstance(condition, Condition)]
@@ -51,7 +53,7 @@ def test_a_command_holds_nothing_measured() -> None:
     """`rendered` is the video at `render_path`, at hand or rendered anew from the commands (pixels.py); of the scene there is
     the first frame, whether its video is at hand or not."""
     named = {"robot", "action", "intrinsics", "extrinsics", "render_path", "rendered", "data", "read_first", "size", "table"}
-    named |= {"parts"}
+    named |= {"parts", "change"}
     assert {field.name for field in fields(Command)} == named
 
 
@@ -114,6 +116,17 @@ def test_a_pasted_render_is_the_baseline_of_that_name(episode: Path) -> None:
     expected = paste_render(read_video(episode / "rgb.mkv")[0], read_video(episode / "robot.mkv"))
     np.testing.assert_array_equal(made, expected)
     assert condition.is_guess and not any(other.is_guess for other in (*STORED, *NUMBERS))
+
+
+def test_shadows_fall_on_the_table_of_the_scene(episode: Path) -> None:
+    record, states = read_record(episode), read_states(episode)
+    up, down = (raised_by(Change("height", level)) for level in (4, 3))
+    assert down < 0 < up
+    commands = [make_command(episode, replace(record, change=change), states) for change in ("light:3", "height:4", "height:3")]
+    pictures = [three_shadows(ROBOTS["piper"], states.action, commands[0].camera, raised) for raised in (0, up, down)]
+    for command, picture in zip(commands, pictures, strict=True):
+        assert np.array_equal(command.shadows, picture)
+    assert not np.array_equal(pictures[0], pictures[1]) and not np.array_equal(pictures[0], pictures[2])
 
 
 def test_joints_are_the_commands(episode: Path) -> None:

@@ -25,7 +25,7 @@ from xew.config import ConfigError
 from xew.dataset import is_stale, view_episode
 from xew.episode import EpisodeError, Record, States, data_folder, read_pixels, read_record, read_states
 from xew.model.video.frames import TEMPORAL_FACTOR
-from xew.protocol import ARMS, CAMERA_SIZE
+from xew.protocol import ARMS, CAMERA_SIZE, parse_change
 
 if TYPE_CHECKING:
     import xew.sim_warp.embodiment.spec
@@ -62,6 +62,8 @@ class Command:
     """Height of the table [m] that hides what lies behind it, as of `Record.table`."""
     parts: tuple["Command", ...] = ()
     """The same commands in each view of a tiled picture, from top to bottom."""
+    change: str = ""
+    """The scene's change, as of `Record.change`."""
 
     @cached_property
     def render(self) -> Video:
@@ -83,11 +85,16 @@ class Command:
     @cached_property
     def shadows(self) -> Video:
         """The robot's shadows on the bare table under three standard lamps [t h w 3] uint8; imports Warp."""
-        from xew.sim_warp.rendering import streams
-
         if self.parts:
             return np.concatenate([part.shadows for part in self.parts], axis=1)
-        return streams.three_shadows(self.robot_spec, self.action, self.camera)
+        return self.draw_shadows(self.action, self.camera)
+
+    def draw_shadows(self, action: Float[np.ndarray, "t 16"], camera: "xew.sim_warp.geometry.camera.Camera") -> Video:
+        """The shadows of other commands [t 16] before another camera, on the table of this scene: [t h w 3] uint8."""
+        from xew.sim_warp.changes.looks import stage_of
+        from xew.sim_warp.rendering.streams import three_shadows
+
+        return three_shadows(self.robot_spec, action, camera, stage_of(parse_change(self.change)).raised)
 
     @cached_property
     def tools(self) -> Float[np.ndarray, "t 2 7"]:
@@ -226,7 +233,18 @@ def make_command(
     size = states.robot_mask.shape[2], states.robot_mask.shape[1]
     parts = tuple(_part_command(view_episode(folder, part)) for part in record.camera.parts)
     return Command(
-        record.robot, states.action, states.intrinsics, extrinsics, render, rendered, data, first, size, record.table, parts
+        record.robot,
+        states.action,
+        states.intrinsics,
+        extrinsics,
+        render,
+        rendered,
+        data,
+        first,
+        size,
+        record.table,
+        parts,
+        record.change,
     )
 
 

@@ -65,9 +65,7 @@ class NewCommand(Command):
     @cached_property
     def shadows(self) -> np.ndarray:
         """The robot's shadows under three lamps [t h w 3] uint8."""
-        from xew.sim_warp.rendering.streams import three_shadows
-
-        return self._fill_up("shadows", lambda action, camera: (three_shadows(self.robot_spec, action, camera),))[0]
+        return self._fill_up("shadows", lambda action, camera: (self.draw_shadows(action, camera),))[0]
 
     def _fill_up(self, name: str, make: Callable[[np.ndarray, "Camera"], Pictures]) -> Pictures:
         """Pictures of all commands, of which `make` renders those that were not rendered before.

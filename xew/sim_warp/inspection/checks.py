@@ -78,7 +78,7 @@ def tile_views(cells: Sequence[Episode], views: Sequence[str]) -> None:
 
 
 def _on_cores(function: Callable[[Path], Result], folders: list[Path], doing: str) -> list[Result]:
-    """Results of episodes in any order, from as many processes as there are cores if there are many episodes, else from here."""
+    """Results of episodes in any order, from a process for each core if there are many episodes, else from this one."""
     with Workers(min(usable_cores(), len(folders) // EPISODES_PER_WORKER), imported=(__name__,)) as workers:
         several = len(folders) >= 2 * EPISODES_PER_WORKER
         results = workers.run(function, folders) if several else map(function, folders)

@@ -4,7 +4,7 @@ To add one, write a pure function of (robot, action, camera) here.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
@@ -121,12 +121,14 @@ def command_renders(
     return [frames.rgb for frames in batch]
 
 
-def three_shadows(robot: RobotSpec, action: np.ndarray, camera: Camera = HEAD_CAMERA) -> np.ndarray:
+def three_shadows(robot: RobotSpec, action: np.ndarray, camera: Camera = HEAD_CAMERA, raised: float = 0.0) -> np.ndarray:
     """The robot of canonical commands [t 16] on the bare table, with a shadow of each of `THREE_LAMPS`: [t h w 3] uint8.
 
-    The three shadows of a part say where it is above the table, whatever lights the scene.
+    The three shadows of a part say where it is above the table, whatever lights the scene. The table's top is `raised` [m] over
+    the standard one.
     """
-    return default_renderer().render_batch(_worlds([(robot, action)]), camera, stage=THREE_LAMPS)[0].rgb
+    stage = replace(THREE_LAMPS, raised=raised)
+    return default_renderer().render_batch(_worlds([(robot, action)]), camera, stage=stage)[0].rgb
 
 
 def _hidden_by(table: float | None) -> dict[str, Any]:
