@@ -215,13 +215,14 @@ SCALING = {
 }
 """The scaling protocol: training on the three robots, K bodies, or both, with tests on Franka, Piper and 32 unseen bodies. The
 model of the three robots is tested on 64 bodies of the wide family, too, for error against distance."""
-CROSSED_BODIES = DISTANCE_BODIES[:32]
-"""Bodies of the wide family for two models, each trained on one half and graded on both."""
+CROSSED_BODIES = (*TRAINING_BODIES, *DISTANCE_BODIES)
+"""Bodies of both families for two models, each trained on one half and graded on both. 128 of them tell looks from kinematics
+with a probability of 0.96, 64 with 0.73 (`xew.analysis.studies.power`)."""
 HALVES = {
     "halves_even": Split(CROSSED_BODIES[0::2], CROSSED_BODIES[1::2]),
     "halves_odd": Split(CROSSED_BODIES[1::2], CROSSED_BODIES[0::2]),
 }
-"""The protocol of halves: every body is rendered by a model that trained on it and by one that did not, as in LOEO, with 32
+"""The protocol of halves: every body is rendered by a model that trained on it and by one that did not, as in LOEO, with 128
 bodies instead of five robots. Keys name the training half by the bodies' numbers."""
 VALIDATION = Split(SEEN_ROBOTS, VALIDATION_BODIES)
 """The fixed split's training robots, with the validation bodies instead of the held-out robots."""
@@ -329,7 +330,7 @@ class Variant:
 
     @property
     def graded_robots(self) -> tuple[str, ...]:
-        """Robots whose test episodes it predicts: the split's robots, training bodies of the wide family, held-out bodies.
+        """Robots whose test episodes it predicts: the split's robots, training bodies of the halves, held-out bodies.
 
         For an adaptation they are FORGETTING_ROBOT and the target.
         """
@@ -337,7 +338,7 @@ class Variant:
             return FORGETTING_ROBOT, self.target
         split = SPLITS[self.split]
         of_paper = tuple(robot for robot in ROBOT_NAMES if robot in (*split.train_robots, *split.held_out_robots))
-        known = tuple(robot for robot in split.train_robots if robot in DISTANCE_BODIES)
+        known = split.train_robots if self.split in HALVES else ()
         return (*of_paper, *known, *(robot for robot in split.held_out_robots if robot not in ROBOT_NAMES))
 
     @property

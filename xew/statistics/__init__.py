@@ -16,7 +16,15 @@ The package stands on the ground: it imports NumPy, SciPy and pandas, and nothin
 """
 
 from xew.statistics.bootstrap import Units, bootstrap_means, find_strata
-from xew.statistics.correlation import every_draw, exact_p, interval_of_r, partial_r, pearson, permutation_p
+from xew.statistics.correlation import (
+    every_draw,
+    exact_p,
+    interval_of_difference,
+    interval_of_r,
+    partial_r,
+    pearson,
+    permutation_p,
+)
 from xew.statistics.inference import DRAWS, LEVEL, SIGNIFICANCE, Component, Drawn, holm
 from xew.statistics.means import MIN_SCENES, Mean, Part, combine, fixed_mean, pool_runs
 from xew.statistics.power import describe_power, find_power
@@ -65,6 +73,7 @@ __all__ = [
     "fixed_mean",
     "floor_sources",
     "holm",
+    "interval_of_difference",
     "interval_of_r",
     "largest_floor",
     "mean_max_rank_violation",

@@ -9,7 +9,7 @@ from functools import lru_cache
 from itertools import permutations, product
 
 import numpy as np
-from scipy.stats import BootstrapMethod, pearsonr
+from scipy.stats import BootstrapMethod, bootstrap, pearsonr
 
 from xew.statistics.inference import DRAWS, LEVEL, SEED
 
@@ -32,6 +32,24 @@ def interval_of_r(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
     resampling = BootstrapMethod(n_resamples=DRAWS, method="BCa", rng=np.random.default_rng(SEED))
     low, high = pearsonr(x, y).confidence_interval(LEVEL, method=resampling)
     return float(low), float(high)
+
+
+def interval_of_difference(first: np.ndarray, second: np.ndarray, y: np.ndarray) -> tuple[float, float]:
+    """Ends of the 95 % interval of r(first, y) - r(second, y), each [n] float64, over draws of triples (BCa bootstrap)."""
+
+    def difference(first: np.ndarray, second: np.ndarray, y: np.ndarray, axis: int = -1) -> np.ndarray:
+        return pearson(first, y) - pearson(second, y)
+
+    drawn = bootstrap(
+        (first, second, y),
+        difference,
+        paired=True,
+        vectorized=True,
+        n_resamples=DRAWS,
+        confidence_level=LEVEL,
+        rng=np.random.default_rng(SEED),
+    )
+    return float(drawn.confidence_interval.low), float(drawn.confidence_interval.high)
 
 
 def partial_r(r: float, with_third: float, between: float) -> float:

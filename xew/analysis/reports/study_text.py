@@ -16,7 +16,7 @@ from xew.analysis.tables.findings import BEATS, FAILS, HOLDS, UNMEASURED, UNRESO
 from xew.analysis.tables.labels import ACTIONS, LADDER, REMEDIES, ROBOT_TITLES, SHORT_ROBOTS
 from xew.analysis.tables.table import format_change, format_signed
 from xew.protocol import BODY_SCALES, FORGETTING_ROBOT, HELD_OUT_ROBOTS, PAPER_PARTS, PARTS
-from xew.statistics import ASSUMED_SPREAD, LEVEL, Mean, strict_metrics
+from xew.statistics import ASSUMED_SPREAD, LEVEL, Mean, interval_of_difference, strict_metrics
 
 
 def trainings_note(grades: StudyGrades) -> str:
@@ -209,6 +209,21 @@ def _halves_sentence(gaps: OverBodies | None) -> Iterator[str]:
             f"Over {len(shares)} bodies, LPIPS is {_format_more(shares.mean())} on average for a model that never saw the body "
             f"than for one that did ({format_change(shares.min())} to {format_change(shares.max())}). "
             f"This gap correlates {' and '.join(parts)}."
+        )
+        yield from _looks_or_kinematics(gaps)
+
+
+def _looks_or_kinematics(gaps: OverBodies) -> Iterator[str]:
+    """Whether the gap of bodies goes more with kinematic or with appearance distance."""
+    if {"kinematic", "appearance"} <= set(gaps.correlations):
+        difference = gaps.correlations["kinematic"].r - gaps.correlations["appearance"].r
+        columns = (gaps.values[name].to_numpy(np.float64) for name in ("kinematic", "appearance", "value"))
+        low, high = interval_of_difference(*columns)
+        kind = "kinematics, not looks" if low > 0 else "looks, not kinematics" if high < 0 else ""
+        answer = f"the gap goes with {kind}" if kind else "which of the two the gap goes with is not resolved"
+        yield (
+            f"The r of kinematic distance minus that of appearance distance is {format_signed(difference)} "
+            f"({format_signed(low)} to {format_signed(high)}): {answer}."
         )
 
 

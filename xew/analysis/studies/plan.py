@@ -24,7 +24,7 @@ from xew.analysis.studies.config import RECIPE, Run, Settings, Study, build_expe
 from xew.config import merge_settings
 from xew.episode import SCHEMA_VERSION
 from xew.files import file_digest, read_text, write_text
-from xew.protocol import DISTANCE_BODIES, GRADING_PROTOCOL, HEAD, RANDOM_CHANGE, SHARED_MOTION, Variant
+from xew.protocol import CROSSED_BODIES, DISTANCE_BODIES, GRADING_PROTOCOL, HEAD, RANDOM_CHANGE, SHARED_MOTION, Variant
 
 TRAININGS = ("train", "adapt")
 """Kinds of steps that keep a GPU busy all the time."""
@@ -356,8 +356,9 @@ def _plan_evaluate(study: Study, variant: Variant) -> Step:
 
 def measured_bodies(study: Study) -> list[str]:
     """Keys of the bodies whose distances are measured in addition to the five robots."""
-    asks = {"bodies", "halves"}.intersection(study.parts)
-    return [robot for robot in study.graded_robots if robot in DISTANCE_BODIES] if asks else []
+    asked = {"bodies": DISTANCE_BODIES, "halves": CROSSED_BODIES}
+    wanted = {body for part, bodies in asked.items() if part in study.parts for body in bodies}
+    return [robot for robot in study.graded_robots if robot in wanted]
 
 
 def _plan_distances(study: Study) -> Step:
