@@ -8,7 +8,9 @@ import pytest
 
 from tests.analysis.test_distance import stick
 from xew.analysis.distance import Args, main
+from xew.analysis.distances.motion import SCENES, command_flows, endpoint_errors
 from xew.protocol import ROBOT_NAMES
+from xew.sim_warp.robots import ROBOTS
 
 OF_ANY_URDF = {"dof", "links", "reach", "volume", "floor", "kinematic", "arm_base", "arm_alone"}
 
@@ -40,13 +42,14 @@ def test_both_matrices_are_written_with_spread_and_the_papers_figures(table: tup
         "arm_alone": 15,
         "appearance": 10,
         "perceptual": 10,
+        "motion": 10,
     }
     by_axis = {axis: frame.set_index(["robot", "other"]) for axis, frame in pairs.groupby("axis")}
     row = by_axis["kinematic"].loc[("arx_x5", "piper")]
     assert row["value"] == pytest.approx(0.034, abs=0.002) and 0 < row["spread"] < 0.003 and row["published"] == 0.034
     assert by_axis["appearance"].loc[("aloha_agilex", "franka_panda")]["published"] == 0.235
     assert by_axis["arm_base"]["published"].isna().all() and by_axis["perceptual"]["published"].isna().all()
-    for axis in ("appearance", "perceptual"):
+    for axis in ("appearance", "perceptual", "motion"):
         assert (by_axis[axis]["value"] > 0).all() and (by_axis[axis]["spread"] > 0).all()
 
 
@@ -57,9 +60,23 @@ def test_aloha_is_two_arms_of_the_make_of_the_arx(table: tuple[Path, str]) -> No
     assert pairs["arm_alone", "aloha_agilex", "arx_x5"] < 0.03 < pairs["arm_base", "aloha_agilex", "arx_x5"]
 
 
+def test_arms_of_one_make_move_alike_and_a_longer_arm_moves_otherwise(table: tuple[Path, str]) -> None:
+    pairs = pd.read_csv(table[0] / "distances.csv").set_index(["axis", "robot", "other"])["value"]["motion"]
+    assert pairs["aloha_agilex", "arx_x5"] == pairs.min() < 0.5 * pairs["aloha_agilex", "piper"]
+    assert pairs["ur5_wsg", "franka_panda"] < pairs["arx_x5", "franka_panda"]
+
+
+def test_motion_is_compared_where_all_robots_can_follow() -> None:
+    flows = [np.zeros((4, 3, 5, 2)), np.full((4, 3, 5, 2), [3.0, 4.0])]
+    np.testing.assert_array_equal(endpoint_errors(flows), [[0, 5], [5, 0]])
+    by_task = command_flows(ROBOTS["piper"])
+    assert list(by_task) == list(SCENES)
+    assert all(flow.shape[1:] == (30, 40, 2) and np.abs(flow).max() > 1 for flow in by_task.values())
+
+
 def test_a_row_for_each_feature_of_each_robot(table: tuple[Path, str]) -> None:
     rows = pd.read_csv(table[0] / "robots.csv").set_index(["robot", "feature"])
-    assert set(rows.loc["piper"].index) == {*OF_ANY_URDF, "appearance", "perceptual"}
+    assert set(rows.loc["piper"].index) == {*OF_ANY_URDF, "appearance", "perceptual", "motion"}
     assert set(rows.loc["stick_0.2"].index) == OF_ANY_URDF
     pairs = pd.read_csv(table[0] / "distances.csv")
     for robot in (*ROBOT_NAMES, "stick_0.2"):

@@ -25,7 +25,8 @@ from xew.analysis.distances.appearance import (
     descriptor_matrix,
     perceptual_matrices,
 )
-from xew.analysis.distances.frames import Axis, distance_frame, matrix_text, robot_frame, robot_text
+from xew.analysis.distances.frames import Axis, distance_frame, jackknifed, matrix_text, robot_frame, robot_text
+from xew.analysis.distances.motion import SCENES, motion_matrices
 from xew.analysis.distances.workspaces import (
     Features,
     Frame,
@@ -66,6 +67,7 @@ TITLES = {
     "arm_alone": "The same of the arm alone [m] (ours)",
     "appearance": "Appearance distance: cosine of hue-saturation histogram and Hu moments of nine views",
     "perceptual": "Perceptual distance of the nine views, mean of squared distances of {} (ours)",
+    "motion": "Motion distance [px]: endpoint error of the commanded optical flow on the same tool paths (ours)",
 }
 OTHER_FRAMES: tuple[Frame, ...] = ("arm_base", "arm_alone")
 FLOOR_SEEDS = 20
@@ -83,7 +85,7 @@ class Args:
     seeds: int = 100
     """Number of draws of configurations, from seed 0 on; they give the spread."""
     looks: bool = True
-    """Render the robots, for the distances of appearance."""
+    """Render the robots, for the distances of appearance and motion."""
     perceptual: str = "xew.metrics:lpips_embedding"
     """module:NAME of a function from images [n h w 3] uint8 to vectors [n d], whose squared distances are measured; empty for
     none. The default's are LPIPS."""
@@ -145,9 +147,12 @@ def _measure_looks(specs: Sequence[RobotSpec], embed: ImageEmbedding | None) -> 
     jackknife = (VIEW_COUNT - 1) / np.sqrt(VIEW_COUNT)
     axes = {"appearance": Axis(robots, descriptor_matrix(described), np.array(without_one), jackknife)}
     if embed is not None:
-        by_view = _measure_perceptual(renders, embed)
-        without_one = (by_view.sum(axis=0) - by_view) / (VIEW_COUNT - 1)
-        axes["perceptual"] = Axis(robots, by_view.mean(axis=0), without_one, jackknife)
+        axes["perceptual"] = jackknifed(robots, _measure_perceptual(renders, embed))
+    moved = motion_matrices(specs)
+    if missing := [task for task in SCENES if task not in moved]:
+        print(f"motion is not compared in {', '.join(missing)}, whose path one of the robots cannot follow")
+    if len(moved) > 1:
+        axes["motion"] = jackknifed(robots, np.array(list(moved.values())))
     return axes
 
 
@@ -185,7 +190,7 @@ def _write(frame: pd.DataFrame, path: Path) -> None:
 
 def _format_legend(seeds: int, looks: bool) -> str:
     spreads = [f"the standard deviation of one draw over {seeds} seeds (kinematic)"] * (seeds > 1)
-    spreads += ["the jackknife's standard error over nine views (appearance, perceptual)"] * looks
+    spreads += ["the jackknife's standard error over nine views (appearance, perceptual) or six tasks (motion)"] * looks
     said = f"± is {' and '.join(spreads)}. " if spreads else ""
     return (
         f"{said}floor: kinematic distance of two draws of the same robot; the robots of a draw share its random numbers. "

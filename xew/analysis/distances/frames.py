@@ -29,6 +29,13 @@ class Axis:
     """Factor from the standard deviation of the draws to the spread."""
 
 
+def jackknifed(robots: tuple[str, ...], parts: np.ndarray) -> Axis:
+    """The mean of the distances [p n n] of several parts, such as views; its spread is the jackknife's over them."""
+    count = len(parts)
+    without_one = (parts.sum(axis=0) - parts) / (count - 1)
+    return Axis(robots, parts.mean(axis=0), without_one, (count - 1) / np.sqrt(count))
+
+
 def distance_frame(axes: Mapping[str, Axis]) -> pd.DataFrame:
     """All pairs as a tidy frame: axis robot other value spread published."""
     paper = read_paper()

@@ -25,6 +25,7 @@ AXIS_TITLES = {
     "arm_base": "From the arm's base [m] (ours)",
     "arm_alone": "Arm alone, from there [m] (ours)",
     "perceptual": "LPIPS of the renders (ours)",
+    "motion": "Motion distance [px] (ours)",
 }
 FEATURE_TITLES = {"dof": "Joints", "links": "Links", "reach": "Reach [m]", "volume": "Volume [m³]"}
 COMMAND = "python -m xew.analysis.distance --out {folder}"
