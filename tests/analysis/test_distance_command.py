@@ -8,7 +8,7 @@ import pytest
 
 from tests.analysis.test_distance import stick
 from xew.analysis.distance import Args, main
-from xew.analysis.distances.motion import SCENES, command_flows, endpoint_errors
+from xew.analysis.distances.motion import SCENES, command_flows, endpoint_errors, make_plans
 from xew.protocol import ROBOT_NAMES
 from xew.sim_warp.robots import ROBOTS
 
@@ -69,7 +69,7 @@ def test_arms_of_one_make_move_alike_and_a_longer_arm_moves_otherwise(table: tup
 def test_motion_is_compared_where_all_robots_can_follow() -> None:
     flows = [np.zeros((4, 3, 5, 2)), np.full((4, 3, 5, 2), [3.0, 4.0])]
     np.testing.assert_array_equal(endpoint_errors(flows), [[0, 5], [5, 0]])
-    by_task = command_flows(ROBOTS["piper"])
+    by_task = command_flows(ROBOTS["piper"], make_plans())
     assert list(by_task) == list(SCENES)
     assert all(flow.shape[1:] == (30, 40, 2) and np.abs(flow).max() > 1 for flow in by_task.values())
 

@@ -196,6 +196,14 @@ def test_latents_of_a_view_depend_on_the_table_before_its_robot(simulated: Path)
     assert {name: len(of_name) for name, of_name in paths.items()} == {"rgb": 1, "action": 3, "embodiment": 3}
 
 
+def test_latents_of_conditions_depend_on_the_height_of_the_table_and_on_no_other_change(simulated: Path) -> None:
+    cache = open_cache(load_experiment(simulated / "config.yaml").encoding)
+    plain = find_accepted(simulated / "data")[0][1]
+    records = [plain, *(replace(plain, change=change) for change in ("light:2", "height:3", "height:4"))]
+    paths = {name: {cache.path(record, name) for record in records} for name in cache.streams}
+    assert {name: len(of_name) for name, of_name in paths.items()} == {"rgb": 1, "action": 3, "embodiment": 3}
+
+
 def test_a_description_of_the_robot_has_a_length_of_its_own(simulated: Path, tmp_path: Path) -> None:
     """Nine views are three latent frames, whatever the length of a clip."""
     config = [str(simulated / "config.yaml"), "--cache", str(tmp_path / "cache"), "--model.embodiment", "nine_views"]

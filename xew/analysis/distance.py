@@ -25,7 +25,7 @@ from xew.analysis.distances.appearance import (
     descriptor_matrix,
     perceptual_matrices,
 )
-from xew.analysis.distances.frames import Axis, distance_frame, jackknifed, matrix_text, robot_frame, robot_text
+from xew.analysis.distances.frames import Axis, distance_frame, jackknifed, matrix_text, mean_axis, robot_frame, robot_text
 from xew.analysis.distances.motion import SCENES, motion_matrices
 from xew.analysis.distances.workspaces import (
     Features,
@@ -110,7 +110,8 @@ def write_distances(args: Args, robots: dict[str, RobotSpec | Urdf], embed: Imag
         draws = measure(robots, range(args.seeds), other).kinematic
         axes[other] = Axis(features.robots, draws.mean(axis=0), draws)
     if args.looks:
-        axes |= _measure_looks([robot for robot in robots.values() if isinstance(robot, RobotSpec)], embed)
+        specs = [robot for robot in robots.values() if isinstance(robot, RobotSpec)]
+        axes |= _measure_looks(specs, embed) | _measure_motion(specs)
     floor = chamfer_floor(robots, range(min(args.seeds, FLOOR_SEEDS)))
     pairs, singles = distance_frame(axes), robot_frame(features, axes, floor)
     for title, axis in axes.items():
@@ -144,16 +145,18 @@ def _measure_looks(specs: Sequence[RobotSpec], embed: ImageEmbedding | None) -> 
     renders, robots = [nine_views(robot) for robot in specs], tuple(robot.key for robot in specs)
     described = np.stack([describe_views(views) for views in renders])
     without_one = [descriptor_matrix(np.delete(described, i, axis=1)) for i in range(VIEW_COUNT)]
-    jackknife = (VIEW_COUNT - 1) / np.sqrt(VIEW_COUNT)
-    axes = {"appearance": Axis(robots, descriptor_matrix(described), np.array(without_one), jackknife)}
+    axes = {"appearance": jackknifed(robots, descriptor_matrix(described), np.array(without_one))}
     if embed is not None:
-        axes["perceptual"] = jackknifed(robots, _measure_perceptual(renders, embed))
+        axes["perceptual"] = mean_axis(robots, _measure_perceptual(renders, embed))
+    return axes
+
+
+def _measure_motion(specs: Sequence[RobotSpec]) -> dict[str, Axis]:
     moved = motion_matrices(specs)
     if missing := [task for task in SCENES if task not in moved]:
         print(f"motion is not compared in {', '.join(missing)}, whose path one of the robots cannot follow")
-    if len(moved) > 1:
-        axes["motion"] = jackknifed(robots, np.array(list(moved.values())))
-    return axes
+    parts = np.array(list(moved.values()))
+    return {"motion": mean_axis(tuple(robot.key for robot in specs), parts)} if len(parts) > 1 else {}
 
 
 def _measure_perceptual(renders: Sequence[np.ndarray], embed: ImageEmbedding) -> np.ndarray:
@@ -190,7 +193,7 @@ def _write(frame: pd.DataFrame, path: Path) -> None:
 
 def _format_legend(seeds: int, looks: bool) -> str:
     spreads = [f"the standard deviation of one draw over {seeds} seeds (kinematic)"] * (seeds > 1)
-    spreads += ["the jackknife's standard error over nine views (appearance, perceptual) or six tasks (motion)"] * looks
+    spreads += ["the jackknife's standard error over nine views (appearance, perceptual) or tasks (motion)"] * looks
     said = f"± is {' and '.join(spreads)}. " if spreads else ""
     return (
         f"{said}floor: kinematic distance of two draws of the same robot; the robots of a draw share its random numbers. "

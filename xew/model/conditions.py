@@ -242,9 +242,9 @@ def make_command(
         data,
         first,
         size,
-        record.table,
-        parts,
-        record.change,
+        table=record.table,
+        parts=parts,
+        change=record.change,
     )
 
 

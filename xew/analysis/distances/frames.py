@@ -29,11 +29,15 @@ class Axis:
     """Factor from the standard deviation of the draws to the spread."""
 
 
-def jackknifed(robots: tuple[str, ...], parts: np.ndarray) -> Axis:
-    """The mean of the distances [p n n] of several parts, such as views; its spread is the jackknife's over them."""
-    count = len(parts)
-    without_one = (parts.sum(axis=0) - parts) / (count - 1)
-    return Axis(robots, parts.mean(axis=0), without_one, (count - 1) / np.sqrt(count))
+def jackknifed(robots: tuple[str, ...], value: np.ndarray, without_one: np.ndarray) -> Axis:
+    """Distances [n n] and those without each of p parts [p n n], such as views, whose jackknife gives the spread."""
+    count = len(without_one)
+    return Axis(robots, value, without_one, (count - 1) / np.sqrt(count))
+
+
+def mean_axis(robots: tuple[str, ...], parts: np.ndarray) -> Axis:
+    """The mean of the distances [p n n] of several parts."""
+    return jackknifed(robots, parts.mean(axis=0), (parts.sum(axis=0) - parts) / (len(parts) - 1))
 
 
 def distance_frame(axes: Mapping[str, Axis]) -> pd.DataFrame:

@@ -10,7 +10,7 @@ from xew.config import digest
 from xew.dataset import Episode
 from xew.episode import Record, episode_folder
 from xew.model.settings.parts import Encoding
-from xew.protocol import HEAD
+from xew.protocol import HEAD, parse_change
 
 CACHE_VERSION = 2
 RUN_SCALES = "scales.json"
@@ -26,6 +26,9 @@ def stream_path(encoding: Encoding, codec_hash: str, record: Record, stream: str
     sources = (record.hashes["rgb"],) if of_scene else (record.hashes["states"], record.hashes["robot"])
     if not of_scene and record.camera.name != HEAD:
         sources = (*sources, record.table)
+    change = parse_change(record.change)
+    if not of_scene and change and change.factor == "height":  # of the table, on which the robot's shadows fall
+        sources = (*sources, record.change)
     if condition is not None and condition.is_guess:
         sources = (*sources, record.hashes["rgb"])
     if condition is not None and (of_scene or condition.with_history):

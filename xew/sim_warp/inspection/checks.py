@@ -1,6 +1,6 @@
 """Checks of a data set: hashes, plausible motion and re-rendering; and rendering of missing videos and views."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import cache, partial
 from pathlib import Path
 from typing import TypeVar
@@ -79,21 +79,29 @@ def tile_views(cells: Sequence[Episode], views: Sequence[str]) -> None:
 
 def _on_cores(function: Callable[[Path], Result], folders: list[Path], doing: str) -> list[Result]:
     """Results of episodes in any order, from a process for each core if there are many episodes, else from this one."""
+    if not _are_many(folders):
+        return _collect(map(function, folders), folders, doing)
     with Workers(min(usable_cores(), len(folders) // EPISODES_PER_WORKER), imported=(__name__,)) as workers:
-        several = len(folders) >= 2 * EPISODES_PER_WORKER
-        results = workers.run(function, folders) if several else map(function, folders)
-        return list(tqdm(results, desc=doing, unit="episode", total=len(folders)))
+        return _collect(workers.run(function, folders), folders, doing)
 
 
 def _render_all(render: Callable[[Path], Result], folders: list[Path]) -> list[Result]:
-    """Render episodes in worker processes if there are many, else here; returns the results in any order."""
+    """The same, rendered on all devices."""
     devices = find_devices(None)
-    several = len(folders) >= 2 * EPISODES_PER_WORKER
+    if not _are_many(folders):
+        return _collect(map(render, folders), folders, "rendering")
     with Workers(worker_count(devices), devices, (__name__,)) as workers:
-        if several:
-            compile_on_devices(workers, {"rendering": devices[0].alias}, 1)
-        results = workers.run(render, folders) if several else map(render, folders)
-        return list(tqdm(results, desc="rendering", unit="episode", total=len(folders)))
+        compile_on_devices(workers, {"rendering": devices[0].alias}, 1)
+        return _collect(workers.run(render, folders), folders, "rendering")
+
+
+def _are_many(folders: list[Path]) -> bool:
+    """Whether so many episodes are worth starting processes."""
+    return len(folders) >= 2 * EPISODES_PER_WORKER
+
+
+def _collect(results: Iterable[Result], folders: list[Path], doing: str) -> list[Result]:
+    return list(tqdm(results, desc=doing, unit="episode", total=len(folders)))
 
 
 def render_changes(folders: list[Path], change: str, out: Path) -> None:
