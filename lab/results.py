@@ -1,6 +1,6 @@
 """Makes what docs/results publishes again from the committed scores: tables, sentences and charts.
 
-Reads  docs/results/<name>/scores.parquet and, where they are there, distances/ and scores.curves.parquet
+Reads  docs/results/<name>/scores.parquet and, where they are there, distances/, shifted/ and scores.curves.parquet
 Writes <name>/tables/*.csv and *.png that are published already, and tables/sentences.txt
 
     python -m lab.results [six_tasks remedies]
@@ -68,6 +68,7 @@ def make_report(folder: Path, out: Path) -> None:
             folder / "scores.parquet",
             distances=distances if distances.is_dir() else None,
             other_motion=RESULTS / other / "scores.parquet" if other else None,
+            shifted=tuple(sorted((folder / "shifted").glob("*.parquet"))),
             out=out,
         )
     )

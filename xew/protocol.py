@@ -161,6 +161,22 @@ TASK_GROUPS = {
 """Tasks by what hands do in them (docs/tasks.md)."""
 FAULT_STRIDE = 10_000_000
 """Distance between the seed of an expert's episode and those of its faults 1, 2, ..., all of which have its scene."""
+FAULT_SEVERITIES: dict[str, tuple[float, ...]] = {
+    "grasp_offset": (5, 10, 20, 30, 40),
+    "close_late": (0.3, 0.45, 0.6),
+    "stay_open": (1,),
+    "open_early": (10, 30, 60),
+    "miss_target": (12, 16, 25, 40, 60),
+    "swap_objects": (1,),
+    "low_lift": (50, 80, 95),
+    "stop": (5, 10, 30, 60),
+    "push": (40, 60, 80),
+    "jitter": (10, 20, 40),
+}
+"""Severities of each kind of fault (docs/tasks.md), of which each is worse than the one before. Seeds number the faults in this
+order: add kinds at the end, and severities as another line there."""
+FAULT_GRADES = (0.0, *(place / len(own) for own in FAULT_SEVERITIES.values() for place in range(1, len(own) + 1)))
+"""How bad a fault is among those of its kind, by its number; the worst of a kind is 1, and the expert, number 0, is 0."""
 
 
 def body_key(number: int) -> str:

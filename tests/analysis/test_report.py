@@ -342,7 +342,7 @@ def test_policies_are_ranked_in_a_table_of_their_own() -> None:
         rows += [key | {"metric": "hallucinated_success", "value": 0.0}] if fault else []
     table = RobotTable("Piper", ("piper",), (), None)
     [ranking] = ranking_tables(pd.DataFrame(rows), [table])
-    assert [section.title for section in ranking.sections] == ["Piper"] and "2 policies" in ranking.caption
+    assert [section.title for section in ranking.sections] == ["Piper"] and "2 graded policies" in ranking.caption
     assert "| mine · flow | 1.000 | 1.000 | 0.000 |" in formats.markdown(ranking)
     assert ranking_tables(pd.DataFrame(rows[:3]), [table]) == [], "the expert alone"
 
@@ -360,7 +360,7 @@ def test_policies_are_points_of_true_and_judged_rates() -> None:
     chart = ranking_chart(pd.DataFrame(rows), {"Pooled: ARX": ("arx_x5",), "Piper": ("piper",)})
     assert [panel.title for panel in chart.panels] == ["Pooled: ARX", "Piper"]
     assert [series.label for series in chart.legend] == [group for group, _ in tasks.values()]
-    judged = chart.data[chart.data["policy"] == 3].set_index(["robots", "tasks"])[["true", "judged", "episodes"]]
+    judged = chart.data[chart.data["policy"] == 1].set_index(["robots", "tasks"])[["true", "judged", "episodes"]]
     assert {key: tuple(row) for key, row in zip(judged.index, judged.to_numpy(), strict=True)} == {
         (robots, group): (0, rate, 2) for robots in ("Pooled: ARX", "Piper") for group, rate in tasks.values()
     }

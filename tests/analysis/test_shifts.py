@@ -72,6 +72,15 @@ def test_costs_are_paired_over_the_scenes_that_all_have(read: tuple[Scores, list
     assert mean is not None and mean.count == 3 * shifts.scenes
 
 
+def test_changes_are_compared_with_every_unseen_robot(read: tuple[Scores, list[Scores]]) -> None:
+    """Of the costs 0, 0.05 and 0.02, the second lies between the robots' 0.03 and 0.1."""
+    shifts = Shifts(*read)
+    assert shifts.compare_changes(MODEL, "lpips") == {"more": [], "less": ["light:1", "height:2"], "unresolved": ["light:3"]}
+    assert shifts.compare_changes(REMEDY, "lpips")["less"] == ["light:1", "light:3", "height:2"], "half of these costs"
+    dear = [replace(table, rows=table.rows.assign(value=table.rows["value"] + 0.5)) for table in read[1]]
+    assert Shifts(read[0], dear).compare_changes(MODEL, "lpips")["more"] == ["light:1", "light:3", "height:2"]
+
+
 def test_a_model_without_its_own_scores_is_left_out(read: tuple[Scores, list[Scores]]) -> None:
     scores, shifted = read
     for left in (MODEL, REMEDY):
@@ -106,4 +115,5 @@ def test_the_report_has_one_table_and_one_chart(tables: tuple[Path, list[Path]],
     main(Args(tables[0], shifted=tuple(tables[1]), out=tmp_path))
     text = (tmp_path / "report.md").read_text()
     assert "## A new robot or a new lamp" in text and "Franka (Panda), never seen" in text
+    assert "- Trained with no changes, a new robot adds 0.100 on Franka and 0.030 on Piper to LPIPS." in text
     assert (tmp_path / "figures" / "shifts.png").stat().st_size > 1000

@@ -289,8 +289,9 @@ def ranking_tables(rows: pd.DataFrame, tables: Sequence[RobotTable]) -> list[Tab
         shown = tuple(_ranking_row(str(model), str(condition), of_model) for (model, condition), of_model in models)
         sections.append(TableSection(str(group), shown))
     caption = (
-        f"Success rates of {ranking['policies'].max()} policies, the expert and its faults, in predicted video against their "
-        "rates in the simulator; 95 % intervals over scenes. r is not defined where all videos show success, or none does."
+        f"Success rates of {ranking['policies'].max()} graded policies in predicted video against those in the simulator, "
+        "with 95 % intervals over scenes. Policy 0 is the expert, and policy k carries out the k-th mildest faulty commands of "
+        "every scene. r is not defined where all videos show success, or none does."
     )
     columns = tuple(map(Column, ("Pearson's r", "Spearman", "MMRV")))
     return [Table("policy_ranking", "Agreement of success rates", caption, ("model",), columns, tuple(sections))]

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from xew.episode import EpisodeError
+from xew.protocol import FAULT_SEVERITIES
 from xew.sim_warp.plan import GRIP_TIME, LEFT, RIGHT, Segment, Timeline, Tool, minimum_jerk
 from xew.sim_warp.scene import Scene, SceneObject, scene_rng
 from xew.sim_warp.tasks.task import GRIPPER_CLOSED
@@ -239,21 +240,20 @@ def _jitter(planner: Planner, scene: Scene, rng: np.random.Generator, severity: 
     return plan
 
 
-KINDS: tuple[tuple[str, str, Change, tuple[float, ...]], ...] = (
-    ("grasp_offset", "mm", _of_a_grip(_offset_grasp), (5, 10, 20, 30, 40)),
-    ("close_late", "s", _of_a_grip(_close_late), (0.3, 0.45, 0.6)),
-    ("stay_open", "", _of_a_grip(_stay_open), (1,)),
-    ("open_early", "%", _of_a_grip(_open_early), (10, 30, 60)),
-    ("miss_target", "mm", _of_a_grip(_miss_target, released=True), (12, 16, 25, 40, 60)),
-    ("swap_objects", "", _swap_objects, (1,)),
-    ("low_lift", "%", _lift_low, (50, 80, 95)),
-    ("stop", "%", _stop, (5, 10, 30, 60)),
-    ("push", "mm", _of_a_grip(_push, released=True), (40, 60, 80)),
-    ("jitter", "%", _jitter, (10, 20, 40)),
-)
-"""Name, unit of the severity, change of the plan, and severities, of which each is worse than the one before. Seeds number the
-faults in this order: add kinds at the end, and severities as another line there."""
-FAULTS = tuple(Fault(name, severity, unit, change) for name, unit, change, severities in KINDS for severity in severities)
+KINDS: dict[str, tuple[str, Change]] = {
+    "grasp_offset": ("mm", _of_a_grip(_offset_grasp)),
+    "close_late": ("s", _of_a_grip(_close_late)),
+    "stay_open": ("", _of_a_grip(_stay_open)),
+    "open_early": ("%", _of_a_grip(_open_early)),
+    "miss_target": ("mm", _of_a_grip(_miss_target, released=True)),
+    "swap_objects": ("", _swap_objects),
+    "low_lift": ("%", _lift_low),
+    "stop": ("%", _stop),
+    "push": ("mm", _of_a_grip(_push, released=True)),
+    "jitter": ("%", _jitter),
+}
+"""Unit of the severity and change of the plan, by the keys of `protocol.FAULT_SEVERITIES`."""
+FAULTS = tuple(Fault(name, severity, *KINDS[name]) for name, own in FAULT_SEVERITIES.items() for severity in own)
 """All faults. A seed names a fault by its place here, from 1 on."""
 
 

@@ -1,5 +1,8 @@
 """Policy ranking: are policies ordered by success in predicted video as they are in the simulator?
 
+The commands of a scene, sorted by how bad their faults are, make as many graded policies: policy 0 is the expert, and policy k
+carries out the k-th mildest faulty commands of every scene. Each has every scene, and shares no episode with another.
+
 Agreement is measured by Pearson's r, Spearman's rank correlation, and the mean maximum rank violation of SIMPLER (X. Li et al.,
 "Evaluating real-world robot manipulation policies in simulation", 2024, arXiv 2405.05941). Intervals are over
 scenes; a policy that no scene of a draw has tried is left out of that draw.
@@ -12,7 +15,7 @@ import numpy as np
 import pandas as pd
 from scipy.stats import rankdata
 
-from xew.protocol import BASELINES, FAULT_STRIDE
+from xew.protocol import BASELINES, FAULT_GRADES, FAULT_STRIDE
 from xew.statistics.bootstrap import Units, bootstrap_means
 from xew.statistics.means import Mean, fixed_mean
 
@@ -62,8 +65,8 @@ RANKINGS: dict[str, Callable[[np.ndarray, np.ndarray], np.ndarray]] = {
 }
 """Functions of judged and true success rates [... p] by name."""
 RANKED = ["robot", "model", "condition", "measure", "value", "low", "high", "policies", "scenes"]
-NEAR_ONE = 1 - 1e-9
-"""Largest correlation on Fisher's scale."""
+NEAR_ONE = 0.999
+"""Largest correlation of draws on Fisher's scale, unless the estimate is larger: its mirror image has no end at 1."""
 BOUNDS = {"pearson": (-1.0, 1.0), "spearman": (-1.0, 1.0), "mmrv": (0.0, 1.0)}
 
 
@@ -93,13 +96,14 @@ def ranking_interval(name: str, mean: Mean) -> tuple[float, float]:
     """Ends of the interval of a measure of RANKINGS over scenes: of its draws and of their mirror image about it.
 
     Rates of few scenes vary by chance, which lowers r and raises MMRV, and draws vary once more: they lie to one side. In a
-    simulation of 250 scenes and 32 policies such an interval holds the true value in 80 to 97 % of cases, and that of the draws
-    alone in 15 to 77 %. Correlations are mirrored on Fisher's scale.
+    simulation of 22 or 66 scenes and 8 policies such an interval holds the true value in 66 to 98 % of cases, and that of the
+    draws alone in 52 to 97 %. Correlations are mirrored on Fisher's scale.
     """
     low, high = mean.interval()
     value, *ends = np.array([mean.value, low, high])
     if BOUNDS[name][0] < 0:
-        value, *ends = np.arctanh(np.clip([value, *ends], -NEAR_ONE, NEAR_ONE))
+        limit = np.clip(abs(value), NEAR_ONE, np.nextafter(1, 0))
+        value, *ends = np.arctanh(np.clip([value, *ends], -limit, limit))
     mirrored = 2 * value - np.array(ends)
     mirrored = np.clip(np.tanh(mirrored) if BOUNDS[name][0] < 0 else mirrored, *BOUNDS[name])
     return min(low, float(mirrored[1])), max(high, float(mirrored[0]))
@@ -108,7 +112,7 @@ def ranking_interval(name: str, mean: Mean) -> tuple[float, float]:
 def policy_outcomes(rows: pd.DataFrame) -> pd.DataFrame:
     """Outcomes of the graded videos: model condition task seed robot policy true judged (1 is success), a row each.
 
-    A policy is the number of a fault, 0 for the expert; the seed is the scene's.
+    A policy is the place of a command among all that the table has of its scene, from mild to bad; the seed is the scene's.
 
     Args:
         rows: of a score table, with the metrics outcome_accuracy and hallucinated_success (which failures alone have).
@@ -117,11 +121,15 @@ def policy_outcomes(rows: pd.DataFrame) -> pd.DataFrame:
     graded = rows[rows["metric"] == "outcome_accuracy"].set_index(key)["value"]
     failed = graded.index.isin(pd.MultiIndex.from_frame(rows.loc[rows["metric"] == "hallucinated_success", key]))
     episodes = pd.DataFrame({"true": (~failed).astype(float), "judged": (failed ^ (graded == 1)).astype(float)}).reset_index()
-    return episodes.assign(policy=episodes["seed"] // FAULT_STRIDE, seed=episodes["seed"] % FAULT_STRIDE)
+    fault = episodes["seed"] // FAULT_STRIDE
+    episodes = episodes.assign(seed=episodes["seed"] % FAULT_STRIDE, fault=fault, grade=np.array(FAULT_GRADES)[fault])
+    commands = episodes[["task", "seed", "fault", "grade"]].drop_duplicates().sort_values(["grade", "fault"])
+    commands["policy"] = commands.groupby(["task", "seed"]).cumcount()
+    return episodes.merge(commands).drop(columns=["fault", "grade"])
 
 
 def rank_policies(rows: pd.DataFrame, groups: Mapping[str, Sequence[str]]) -> pd.DataFrame:
-    """How models rank policies: the expert and its faults, each a policy with a success rate over scenes.
+    """How models rank graded policies by their success rates over scenes.
 
     Args:
         rows: as of `policy_outcomes`.

@@ -72,6 +72,21 @@ class Shifts:
         means = self.mean(model, case, metric), self.mean(model, "", metric)
         return combine(np.subtract, means[0], means[1]) if means[0] and means[1] else None
 
+    def compare_changes(self, model: str, metric: str) -> dict[str, list[str]]:
+        """Changes by whether they cost a model more or less than every unseen robot does, or neither is resolved.
+
+        Keys are more, less and unresolved. A change costs more or less if the interval of the difference of its cost from that
+        of each unseen robot lies on one side of 0.
+        """
+        found: dict[str, list[str]] = {"more": [], "less": [], "unresolved": []}
+        robots = [cost for robot in ROBOTS.held_out_robots if (cost := self.cost(model, robot, metric))]
+        sign = -1 if self.metrics[metric].higher_is_better else 1
+        for change in self.changes:
+            if robots and (cost := self.cost(model, change, metric)):
+                ends = sign * np.array([combine(np.subtract, cost, robot).interval() for robot in robots])
+                found["more" if (ends > 0).all() else "less" if (ends < 0).all() else "unresolved"].append(change)
+        return found
+
     @property
     def cases(self) -> dict[str, str]:
         """Titles of all cases that are compared with the training robots in unchanged scenes."""

@@ -109,7 +109,7 @@ def _numbers(score: Interval) -> tuple[float, float, float]:
 
 def study_contests(grades: StudyGrades) -> Iterator[tuple[str, str, Contest]]:
     """The contests of a study's held-out robots: the robot's key, the best variant that never saw it, and the contest."""
-    rows = [("fixed", "fixed"), *product(["actions"], ACTIONS), *product(["ladder"], LADDER)]
+    rows = [("fixed", "fixed"), ("shifts", "fixed"), *product(["actions"], ACTIONS), *product(["ladder"], LADDER)]
     for robot in HELD_OUT_ROBOTS if METRIC in grades.metrics else ():
         means = {row: mean for row in rows if (mean := grades.mean(*row, robot, METRIC))}
         best = min(means, key=lambda row: means[row].value, default=None)

@@ -168,7 +168,7 @@ def bars(axes: Axes, labels: Sequence[str], groups: Sequence[tuple[str, np.ndarr
                 axes.text(end / 2, at, f"{value:,.0f}", va="center", ha="center", color=GROUND, fontsize=7)
     axes.axvline(0, color=SOFT, linewidth=0.8)
     axes.set_yticks(range(len(labels)), labels)
-    axes.invert_yaxis()
+    axes.set_ylim(len(labels) - 0.4, -0.6)
     axes.grid(visible=False, axis="y")
     axes.set_xlabel(unit)
 

@@ -186,7 +186,7 @@ def build(
     content = Content(
         TITLE,
         answer([contest for *_, contest in contests], answer_strip(shown, scores.frame_zero)),
-        study_sentences(grades, known, (difficulty.get("lpips"), gaps.get("lpips")), motions, findings, by_paper),
+        study_sentences(grades, known, (difficulty.get("lpips"), gaps.get("lpips")), motions, shifts, findings, by_paper),
         {HERE: findings, BY_PAPER: by_paper, PRINTED: by_print} if of_paper else {},
         CLAIMS_TEXT,
         {table.name: table for table in tables},

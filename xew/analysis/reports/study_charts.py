@@ -273,7 +273,7 @@ def ranking_chart(rows: pd.DataFrame, groups: Mapping[str, Sequence[str]]) -> Ch
         for names, points in data.groupby(["robots", "model", "condition"], sort=False)
     ]
     legend = [Series(tasks, color, "o") for tasks, color in colors.items() if (data["tasks"] == tasks).any()]
-    caption = "A point is the expert or a fault, in one group of tasks. On the line, the judged rate is the true one."
+    caption = "A point is a graded policy in one group of tasks. On the line, the judged rate is the true one."
     return Chart("policies", caption, panels, data, legend, columns=len(groups))
 
 

@@ -5,7 +5,8 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 import pandas as pd
 
-from xew.analysis.beyond import Motions, OverBodies
+from xew.analysis.beyond import Motions, OverBodies, Shifts
+from xew.analysis.beyond.shifts import MODELS
 from xew.analysis.paper import AXES
 from xew.analysis.scores import Scores, describe_scores
 from xew.analysis.statistics.grades import BODIES, Grades, StudyGrades, paired_means, relative_gain
@@ -42,6 +43,7 @@ def study_sentences(
     distances: Distances,
     over_bodies: tuple[OverBodies | None, OverBodies | None],
     motions: Motions | None,
+    shifts: Shifts | None,
     findings: Sequence[Finding],
     by_paper: Sequence[Finding],
 ) -> list[str]:
@@ -59,6 +61,7 @@ def study_sentences(
         *_bodies_sentence(errors),
         *_halves_sentence(gaps),
         *_motion_sentences(motions),
+        *_shifts_sentences(shifts),
     ]
 
 
@@ -239,6 +242,24 @@ def _motion_sentences(motions: Motions | None) -> Iterator[str]:
         ]
         if parts:
             yield f"From shared to own motion, LPIPS on {ROBOT_TITLES[robot]} changes by {', '.join(parts)}."
+
+
+def _shifts_sentences(shifts: Shifts | None) -> Iterator[str]:
+    for model in shifts.models if shifts else ():
+        costs = {robot: shifts.cost(model, robot, "lpips") for robot in HELD_OUT_ROBOTS}
+        added = [f"{cost.value:.3f} on {SHORT_ROBOTS[robot]}" for robot, cost in costs.items() if cost]
+        compared = shifts.compare_changes(model, "lpips")
+        named = {"more": "Changes that add more", "less": "Changes that add less", "unresolved": "Not resolved"}
+        lists = [f"{title}: {_list_changes(compared[word])}." for word, title in named.items() if compared[word]]
+        if added:
+            yield f"Trained with {MODELS[model]}, a new robot adds {' and '.join(added)} to LPIPS. {' '.join(lists)}"
+
+
+def _list_changes(changes: Sequence[str]) -> str:
+    """Text such as 'light 1, 2; table 3'."""
+    pairs = [change.partition(":")[::2] for change in changes]
+    levels = {factor: ", ".join(level for other, level in pairs if other == factor) for factor, _ in pairs}
+    return "; ".join(f"{factor} {own}" for factor, own in levels.items())
 
 
 def _correlations(difficulty: OverBodies) -> list[str]:

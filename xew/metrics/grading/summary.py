@@ -116,7 +116,8 @@ def ranking_to_markdown(ranking: pd.DataFrame) -> str:
     if ranking.empty:
         return ""
     lines = ["", "## Policy ranking", ""]
-    lines += ["The expert and its faults are policies: success rates in predicted video against those in the simulator.", ""]
+    lines += ["Success rates in predicted video against those in the simulator."]
+    lines += ["Policies are graded: the expert, then the k-th mildest faulty commands of every scene.", ""]
     lines += ["| robot | model | Pearson's r | Spearman | MMRV | policies | scenes |", "|---|---|---|---|---|---|---|"]
     for (robot, *model), own in ranking.groupby(["robot", "model", "condition"], sort=False):
         cells = [
