@@ -69,5 +69,5 @@ def check_motions(report: str, page: str) -> None:
 
 
 def test_there_are_results() -> None:
-    names = ["all_tasks", "bodies", "bodies_debug", "own_motion", "recipe", "remedies", "six_tasks"]
+    names = ["all_tasks", "bodies", "bodies_debug", "outcome", "own_motion", "recipe", "remedies", "shifts", "six_tasks"]
     assert [folder.name for folder in FOLDERS] == names
