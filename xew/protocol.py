@@ -176,7 +176,7 @@ FAULT_SEVERITIES: dict[str, tuple[float, ...]] = {
 """Severities of each kind of fault (docs/tasks.md), of which each is worse than the one before. Seeds number the faults in this
 order: add kinds at the end, and severities as another line there."""
 FAULT_GRADES = (0.0, *(place / len(own) for own in FAULT_SEVERITIES.values() for place in range(1, len(own) + 1)))
-"""Grade of each fault by its number: its place among the severities of its kind, 1 for the worst; 0 for the expert, number 0."""
+"""Grade of each fault by its number: its place among the severities of its kind, 1 for the worst; 0 for the expert."""
 
 
 def body_key(number: int) -> str:
