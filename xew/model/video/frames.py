@@ -47,8 +47,15 @@ def to_model_size(video: np.ndarray, height: int, width: int) -> np.ndarray:
 
 def _pad_edges(video: np.ndarray, padding: Padding) -> np.ndarray:
     """A video [t h w 3] with repeated edges [t h' w' 3]."""
-    sides = padding.top, padding.bottom, padding.left, padding.right
-    return np.stack([cv2.copyMakeBorder(frame, *sides, cv2.BORDER_REPLICATE) for frame in video])
+    frames, height, width, channels = video.shape
+    top, left = padding.top, padding.left
+    padded = np.empty((frames, top + height + padding.bottom, left + width + padding.right, channels), video.dtype)
+    padded[:, top : top + height, left : left + width] = video  # written once: single frames joined later cost ten times as much
+    padded[:, top : top + height, :left] = video[:, :, :1]
+    padded[:, top : top + height, left + width :] = video[:, :, -1:]
+    padded[:, :top] = padded[:, top : top + 1]
+    padded[:, top + height :] = padded[:, top + height - 1 : top + height]
+    return padded
 
 
 def to_camera_size(video: np.ndarray, size: Size = CAMERA_SIZE) -> np.ndarray:
