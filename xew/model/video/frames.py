@@ -50,7 +50,7 @@ def _pad_edges(video: np.ndarray, padding: Padding) -> np.ndarray:
     frames, height, width, channels = video.shape
     top, left = padding.top, padding.left
     padded = np.empty((frames, top + height + padding.bottom, left + width + padding.right, channels), video.dtype)
-    padded[:, top : top + height, left : left + width] = video  # written once: single frames joined later cost ten times as much
+    padded[:, top : top + height, left : left + width] = video  # joining single frames takes ten times as long
     padded[:, top : top + height, :left] = video[:, :, :1]
     padded[:, top : top + height, left + width :] = video[:, :, -1:]
     padded[:, :top] = padded[:, top : top + 1]
