@@ -245,7 +245,9 @@ def _motion_sentences(motions: Motions | None) -> Iterator[str]:
 
 
 def _shifts_sentences(shifts: Shifts | None) -> Iterator[str]:
-    for model in shifts.models if shifts else ():
+    if shifts is None:
+        return
+    for model in shifts.models:
         costs = {robot: shifts.cost(model, robot, "lpips") for robot in HELD_OUT_ROBOTS}
         added = [f"{cost.value:.3f} on {SHORT_ROBOTS[robot]}" for robot, cost in costs.items() if cost]
         compared = shifts.compare_changes(model, "lpips")
