@@ -121,11 +121,11 @@ def policy_outcomes(rows: pd.DataFrame) -> pd.DataFrame:
     graded = rows[rows["metric"] == "outcome_accuracy"].set_index(key)["value"]
     failed = graded.index.isin(pd.MultiIndex.from_frame(rows.loc[rows["metric"] == "hallucinated_success", key]))
     episodes = pd.DataFrame({"true": (~failed).astype(float), "judged": (failed ^ (graded == 1)).astype(float)}).reset_index()
-    fault = episodes["seed"] // FAULT_STRIDE
-    episodes = episodes.assign(seed=episodes["seed"] % FAULT_STRIDE, fault=fault, grade=np.array(FAULT_GRADES)[fault])
-    commands = episodes[["task", "seed", "fault", "grade"]].drop_duplicates().sort_values(["grade", "fault"])
-    commands["policy"] = commands.groupby(["task", "seed"]).cumcount()
-    return episodes.merge(commands).drop(columns=["fault", "grade"])
+    episodes = episodes.assign(fault=episodes["seed"] // FAULT_STRIDE, seed=episodes["seed"] % FAULT_STRIDE)
+    commands = episodes[["task", "seed", "fault"]].drop_duplicates()
+    commands = commands.assign(grade=np.array(FAULT_GRADES)[commands["fault"]]).sort_values(["grade", "fault"])
+    commands = commands.assign(policy=commands.groupby(["task", "seed"]).cumcount()).drop(columns="grade")
+    return episodes.merge(commands).drop(columns="fault")
 
 
 def rank_policies(rows: pd.DataFrame, groups: Mapping[str, Sequence[str]]) -> pd.DataFrame:

@@ -39,23 +39,11 @@ def padding_to(height: int, width: int, size: Size = CAMERA_SIZE) -> Padding:
 
 def to_model_size(video: np.ndarray, height: int, width: int) -> np.ndarray:
     """Camera frames uint8 [t h w 3] -> [t height width 3]."""
-    padded = _pad_edges(video, padding_to(height, width, picture_size(video)))
+    top, bottom, left, right = padding_to(height, width, picture_size(video))
+    padded = np.pad(video, ((0, 0), (top, bottom), (left, right), (0, 0)), mode="edge")
     if padded.shape[1:3] == (height, width):
         return padded
     return np.stack([cv2.resize(frame, (width, height), interpolation=cv2.INTER_AREA) for frame in padded])
-
-
-def _pad_edges(video: np.ndarray, padding: Padding) -> np.ndarray:
-    """A video [t h w 3] with repeated edges [t h' w' 3]."""
-    frames, height, width, channels = video.shape
-    top, left = padding.top, padding.left
-    padded = np.empty((frames, top + height + padding.bottom, left + width + padding.right, channels), video.dtype)
-    padded[:, top : top + height, left : left + width] = video  # joining single frames takes ten times as long
-    padded[:, top : top + height, :left] = video[:, :, :1]
-    padded[:, top : top + height, left + width :] = video[:, :, -1:]
-    padded[:, :top] = padded[:, top : top + 1]
-    padded[:, top + height :] = padded[:, top + height - 1 : top + height]
-    return padded
 
 
 def to_camera_size(video: np.ndarray, size: Size = CAMERA_SIZE) -> np.ndarray:
