@@ -63,13 +63,13 @@ class Dataset:
         tasks: Collection[str] | None = None,
         split: str | None = None,
         motion: str | None = None,
-        faults: bool | None = None,
+        faults: bool = True,
     ) -> list[Episode]:
         """Accepted episodes of these robots, tasks and seed family; None selects all. The list may be empty.
 
         Args:
             motion: required kind of motion (`Split.motion`); None accepts any.
-            faults: whether to select the faulty episodes alone, or the experts' alone.
+            faults: whether to select faulty episodes too.
 
         Raises:
             EpisodeError: the data set has no accepted episode, or a selected one has another kind of motion.
@@ -80,7 +80,7 @@ class Dataset:
             if (robots is None or record.robot in robots)
             and (tasks is None or record.task in tasks)
             and split in (None, seed_split(record.seed))
-            and faults in (None, bool(record.fault))
+            and (faults or not record.fault)
         ]
         if motion is not None:
             demand_motion(self.root, (record for _, record in chosen), motion)

@@ -9,7 +9,7 @@ import pytest
 from tests.analysis.test_results_pages import RESULTS, demand, read_rows, row_of
 from xew.analysis.beyond import Shifts
 from xew.analysis.scores import read_scores
-from xew.protocol import GROUND_TRUTH, HELD_OUT_ROBOTS, SEEN_ROBOTS
+from xew.protocol import FAULT_STRIDE, GROUND_TRUTH, HELD_OUT_ROBOTS, SEEN_ROBOTS
 from xew.statistics import policy_outcomes
 
 FRANKA, PIPER = HELD_OUT_ROBOTS
@@ -98,6 +98,27 @@ def test_sentences_on_outcomes() -> None:
     assert "right in {2:.0f} % on Franka, {1:.0f} % on Piper and {0:.0f} % on training robots".format(*right) in page
     assert f"the judge reads {100 - readable[2]:.0f} % of the *true* videos wrong" in page
     assert f"{100 * own['true'].mean():.0f} % of them succeed" in page
+
+
+TRAINED = {
+    "LPIPS of the experts' episodes ↓": "lpips",
+    "mean outcome accuracy ↑": "outcome_accuracy",
+    "mean progress error ↓": "progress_error",
+    "successes among 78 failures ↓": "hallucinated_success",
+    "strict object error [px] ↓": "trajectory_error_strict",
+}
+"""Metric of each row on training on failures; LPIPS is of the experts' episodes alone, and successes are counted."""
+
+
+@pytest.mark.parametrize("label", TRAINED)
+def test_training_on_failures(label: str) -> None:
+    rows = read_scores(RESULTS / "outcome" / "training_on_failures.parquet").rows
+    rows = rows[(rows["metric"] == TRAINED[label]) & ((rows["metric"] != "lpips") | (rows["seed"] < FAULT_STRIDE))]
+    by_model = rows.groupby("model")["value"]
+    values = by_model.sum() if "among" in label else by_model.mean()
+    assert by_model.size().nunique() == 1 and ("among" not in label or by_model.size().iloc[0] == 78)
+    for cell, share in zip(row_of("outcome", label), ("0", "0.25", "0.5"), strict=True):
+        demand(cell, [values[f"failures_{share}_{seed}"] for seed in (0, 1)])
 
 
 @cache

@@ -115,8 +115,7 @@ class Experiment:
         adapt, targets, replay = self.adapt, expand_robots(self.adapt.robots), tuple[str, ...]()
         samples = sample_roles(self.robots, targets) if self.train.samples else {}
         if adapt.start_from is None:
-            faults = self.train.faults > 0
-            return EpisodeChoice(self.robots.train_robots, faults=faults, samples=samples, motion=self.robots.motion)
+            return EpisodeChoice(self.robots.train_robots, samples=samples, motion=self.robots.motion)
         if adapt.replay:
             source = load_recorded(adapt.start_from / "config.yaml").robots.train_robots
             replay = tuple(robot for robot in source if robot not in targets)
@@ -125,8 +124,7 @@ class Experiment:
     @property
     def spec(self) -> TrainSpec:
         """Training specification; `TrainSpec.with_steps` sets the steps of a run whose length is in epochs."""
-        mixed = self.adapt.replay or self.train.faults
-        return TrainSpec(self.network, self.inputs, self.train, mixed, self.adapt.lora_rank)
+        return TrainSpec(self.network, self.inputs, self.train, self.adapt.replay, self.adapt.lora_rank)
 
     @property
     def schedule(self) -> NoiseSchedule:

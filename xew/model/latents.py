@@ -31,7 +31,7 @@ from xew.model.cache.store import LatentCache, load_codec
 from xew.model.codecs.ceiling import check_lpips, choose_evenly, measure_ceiling
 from xew.model.codecs.contract import Codec
 from xew.model.conditions import shown_scene
-from xew.model.episodes.choice import mixed_episodes, training_episodes
+from xew.model.episodes.choice import replayed_episodes, training_episodes
 from xew.model.episodes.commands import episode_command
 from xew.model.experiment import Experiment, parse_experiment
 from xew.model.settings.settings import Clip
@@ -83,7 +83,7 @@ def encode_experiment(experiment: Experiment, source: PixelSource = stored_pixel
     encoding, choice, dataset = experiment.encoding, experiment.choice, read_dataset(experiment.episodes)
     if experiment.cache is None and encoding.folder.is_symlink():
         raise ConfigError(f"{encoding.folder} is a link; name the folder that it leads to: --cache {encoding.folder.resolve()}")
-    episodes, mixed = training_episodes(dataset, choice), mixed_episodes(dataset, choice)
+    episodes, replayed = training_episodes(dataset, choice), replayed_episodes(dataset, choice)
     codec = load_codec(encoding)
     with hold_lock(encoding.folder, wait=True):
         keep_scales(encoding, episodes)
@@ -96,14 +96,14 @@ def encode_experiment(experiment: Experiment, source: PixelSource = stored_pixel
         with ThreadPoolExecutor(1) as thread:
             # Where processes read, and others encode on several GPUs, this one measures the ceiling meanwhile.
             measured = thread.submit(measure) if jax.default_backend() != "cpu" and processes != 1 else None
-            written = encode_episodes(cache, [*episodes, *mixed], source, batch, processes)
+            written = encode_episodes(cache, [*episodes, *replayed], source, batch, processes)
             ceiling = measured.result() if measured else measure()
         header = {"version": CACHE_VERSION, "codec": codec.decoder_hash, "clip": asdict(experiment.clip)}
         header |= {"streams": list(cache.streams), "episodes": len(episodes), "ceiling": ceiling}
         write_text(encoding.folder / "header.json", json.dumps(header, indent=1) + "\n", within=encoding.folder)
     robots, streams = sorted({record.robot for _, record in episodes}), ", ".join(cache.streams)
     named = ", ".join(robots) if len(robots) <= MOST_NAMED else f"{len(robots)} robots"
-    others = f", and {len(mixed)} that are mixed in" if mixed else ""
+    others = f", and {len(replayed)} that are replayed" if replayed else ""
     print(f"{encoding.folder}: {len(episodes)} episodes of {named}{others}")
     print(f"streams {streams}, {written / 1e6:.1f} MB new")
 

@@ -105,16 +105,16 @@ def train(experiment: Experiment, *, resume: bool = False, overwrite: bool = Fal
     own = process_samples(mesh, experiment.train.batch)
     check_start(experiment)
     episodes = choose_episodes(read_dataset(experiment.episodes), experiment.choice)
-    source = ClipSource.open(experiment.encoding, experiment.instructions, episodes.fresh, episodes.mixed)
+    source = ClipSource.open(experiment.encoding, experiment.instructions, episodes.fresh, episodes.replayed)
     source.check()
     spec = experiment.spec.with_steps(source.fresh)
     settings = spec.settings
     codec = source.cache.codec
     trainer = make_trainer(spec, mesh, codec)
-    batches = iter(make_dataset(source, settings.batch, settings.seed, spec.mixed, own, trainer.place))
+    batches = iter(make_dataset(source, settings.batch, settings.seed, spec.replayed, own, trainer.place))
     check_memory(estimate_memory(trainer, experiment.encoding), ignore=ignore_memory)
 
-    trained = (*episodes.fresh, *episodes.mixed)
+    trained = (*episodes.fresh, *episodes.replayed)
     source.scales = begin_run(experiment, codec, source.scales, trained, resume=resume, overwrite=overwrite)
     timetable = Timetable(
         settings.steps, settings.log_every, settings.save_every, sample_steps(settings), learning_rate(settings)

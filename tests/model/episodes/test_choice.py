@@ -67,14 +67,9 @@ def with_faults(*families: str) -> Dataset:
     return Dataset(whole.root, (*whole.cells, *((Path("data") / str(r.seed) / r.robot, r) for r in of_faults)))
 
 
-def test_faulty_episodes_of_training_seeds_are_mixed_in_where_asked() -> None:
-    data, asked = with_faults(*FAMILIES), EpisodeChoice(FIXED.train_robots, samples=sample_roles(FIXED))
-    without, mixing = choose_episodes(data, asked), choose_episodes(data, replace(asked, faults=True))
-    assert without == choose_episodes(dataset(*FAMILIES), asked) and without.mixed == []
-    assert (mixing.fresh, mixing.samples) == (without.fresh, without.samples)
-    assert {(record.seed, record.robot) for _, record in mixing.mixed} == {
-        (join_fault(3, seed), robot) for seed in range(2) for robot in FIXED.train_robots
-    }
+def test_faulty_episodes_never_train() -> None:
+    asked = EpisodeChoice(FIXED.train_robots, replay=("piper",), samples=sample_roles(FIXED))
+    assert choose_episodes(with_faults(*FAMILIES), asked) == choose_episodes(dataset(*FAMILIES), asked)
 
 
 def test_few_shots_are_the_experts() -> None:
@@ -82,11 +77,6 @@ def test_few_shots_are_the_experts() -> None:
     assert [record.seed for _, record in training_episodes(with_faults("train"), asked)] == [0, 1]
     with pytest.raises(ConfigError, match="there are only 2 training episodes of piper"):
         training_episodes(with_faults("train"), replace(asked, shots=3))
-
-
-def test_mixing_in_needs_faulty_episodes_of_training_seeds() -> None:
-    with pytest.raises(ConfigError, match=r"data has no training episode of faulty commands; make some: .* --faults 8 --out"):
-        choose_episodes(with_faults("validation", "test"), EpisodeChoice(FIXED.train_robots, faults=True))
 
 
 @pytest.mark.parametrize(("faults", "count"), [(True, 4), (False, 2)])
@@ -103,7 +93,7 @@ def test_training_refuses_mixed_frame_rates(robot: str, rate: float) -> None:
     whole = dataset("train", "test", robots=ROBOT_NAMES)
     cells = [(path, replace(record, frame_rate=rate) if record.robot == robot else record) for path, record in whole.cells]
     asked = EpisodeChoice(("ur5_wsg",), replay=("arx_x5",))
-    assert len(choose_episodes(whole, asked).mixed) == 2
+    assert len(choose_episodes(whole, asked).replayed) == 2
     with pytest.raises(EpisodeError, match=rf"data has episodes at 16.67 \(2\) and at {rate:.2f} \(2\) frames per second"):
         choose_episodes(Dataset(whole.root, tuple(cells)), asked)
 

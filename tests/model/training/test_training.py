@@ -21,7 +21,7 @@ from xew.dataset import read_dataset
 from xew.model import latents, train
 from xew.model.devices.sharding import AXES, make_mesh, place_batch
 from xew.model.diffusion.flow_matching import sample_losses
-from xew.model.episodes.choice import first_of_each, mixed_episodes, sample_episodes, training_episodes
+from xew.model.episodes.choice import first_of_each, replayed_episodes, sample_episodes, training_episodes
 from xew.model.experiment import Experiment, load_experiment
 from xew.model.network.lora import apply_lora, init_lora
 from xew.model.runs import checkpoint
@@ -376,6 +376,7 @@ def test_epochs_are_passes_over_the_new_samples(experiment: Experiment) -> None:
         (["--train.ema", "0.5"], "train.ema is 0.5 of the run; it must be at most 0.25"),
         (["--adapt.robots", "piper"], "adapt is set without adapt.start_from"),
         (["--adapt.start-from", "x", "--adapt.robots", "piper", "--adapt.replay", "0.9"], "a part below 1 that leaves"),
+        (["--adapt.start-from", "x", "--adapt.robots", "piper", "--adapt.replay", "-0.1"], "adapt.replay is -0.1 of"),
         (["--adapt.start-from", "nowhere", "--adapt.robots", "piper"], "nowhere holds no run"),
     ],
 )
@@ -450,7 +451,7 @@ def test_adaptation_learns_from_few_episodes_of_the_target(world: Path, experime
         (record.task, record.robot, record.seed) for _, record in training_episodes(read_dataset(adapted.data), adapted.choice)
     }
     assert chosen == {("place_empty_cup", "piper", 0), ("shake_bottle", "piper", 0)}
-    assert mixed_episodes(read_dataset(adapted.data), adapted.choice) == []
+    assert replayed_episodes(read_dataset(adapted.data), adapted.choice) == []
     with pytest.raises(ConfigError, match=r"adapt.episodes is 3, there are only 2 training episodes of piper"):
         more = replace(adapted, adapt=replace(adapted.adapt, episodes=2)).choice
         first_of_each(training_episodes(read_dataset(adapted.data), more), 3)
@@ -490,7 +491,7 @@ def test_replay_is_a_part_of_every_batch(world: Path, experiment: Experiment) ->
     settings = replace(experiment.adapt, start_from=world / "run", robots=("piper",), episodes=2, replay=0.25)
     adapted = replace(experiment, adapt=settings)
     old, new = (
-        mixed_episodes(read_dataset(adapted.data), adapted.choice),
+        replayed_episodes(read_dataset(adapted.data), adapted.choice),
         training_episodes(read_dataset(adapted.data), adapted.choice),
     )
     assert {record.robot for _, record in old} == {"aloha_agilex", "arx_x5", "ur5_wsg"}
@@ -500,7 +501,7 @@ def test_replay_is_a_part_of_every_batch(world: Path, experiment: Experiment) ->
             return Batch(np.array(self.samples[index][0].robot == "piper"), {}, np.array(index))
 
     source = Names.open(adapted.encoding, adapted.instructions, new, old)
-    batches = iter(make_dataset(source, 8, seed=0, mixed=0.25))
+    batches = iter(make_dataset(source, 8, seed=0, replayed=0.25))
     drawn = [next(batches) for _ in range(6)]
     assert all(batch.latents.sum() == 6 for batch in drawn)
     assert len({int(index) for batch in drawn for index in batch.text[6:]}) == 12, "replay goes on through its episodes"

@@ -17,8 +17,8 @@ class TrainingEpisodes:
 
     fresh: list[Episode]
     """Training episodes."""
-    mixed: list[Episode]
-    """Training episodes that a part of every batch is drawn from (`mixed_episodes`)."""
+    replayed: list[Episode]
+    """Training episodes that a part of every batch is drawn from (`replayed_episodes`)."""
     samples: dict[str, Episode]
     """Episodes of sample videos, by role and robot."""
 
@@ -30,9 +30,9 @@ def choose_episodes(dataset: Dataset, choice: EpisodeChoice) -> TrainingEpisodes
         ConfigError, EpisodeError: there are no or too few training episodes, or they have several frame rates.
     """
     samples = sample_episodes(dataset, choice.samples, choice.motion)
-    fresh, mixed = training_episodes(dataset, choice), mixed_episodes(dataset, choice)
-    demand_one_rate(dataset.root, (record for _, record in (*fresh, *mixed)))
-    return TrainingEpisodes(fresh, mixed, samples)
+    fresh, replayed = training_episodes(dataset, choice), replayed_episodes(dataset, choice)
+    demand_one_rate(dataset.root, (record for _, record in (*fresh, *replayed)))
+    return TrainingEpisodes(fresh, replayed, samples)
 
 
 def training_episodes(dataset: Dataset, choice: EpisodeChoice) -> list[Episode]:
@@ -45,19 +45,9 @@ def training_episodes(dataset: Dataset, choice: EpisodeChoice) -> list[Episode]:
     return _select_training(dataset, choice.robots, choice.motion, shots=choice.shots, need_all=choice.shots > 0)
 
 
-def mixed_episodes(dataset: Dataset, choice: EpisodeChoice) -> list[Episode]:
-    """Episodes of which every batch has a part: the faulty ones of the training seeds, or those that an adaptation replays,
-    which are training episodes of the run that it starts from. Raises as `training_episodes`.
-    """
-    if choice.replay:
-        return _select_training(dataset, choice.replay, choice.motion, need_all=True)
-    faulty = dataset.select(robots=choice.robots, split="train", motion=choice.motion, faults=True) if choice.faults else []
-    if choice.faults and not faulty:
-        raise ConfigError(
-            f"train.faults is set, and {dataset.root} has no training episode of faulty commands; make some: python -m "
-            f"xew.sim_warp.generate --faults 8 --out {dataset.root}, or set train.faults to 0."
-        )
-    return faulty
+def replayed_episodes(dataset: Dataset, choice: EpisodeChoice) -> list[Episode]:
+    """Episodes that an adaptation replays, training episodes of the run that it starts from. Raises as `training_episodes`."""
+    return _select_training(dataset, choice.replay, choice.motion, need_all=True) if choice.replay else []
 
 
 def _select_training(dataset: Dataset, robots: Sequence[str], motion: str, *, shots: int = 0, need_all: bool) -> list[Episode]:
@@ -106,7 +96,7 @@ def select_episodes(data: Path, split: str, robots: Sequence[str] | None = None,
     missing = [robot for robot in robots or () if robot not in dataset.robots]
     if missing:
         raise explain_missing_robots(dataset, missing)
-    chosen = dataset.select(robots=robots, split=split, faults=None if faults else False)
+    chosen = dataset.select(robots=robots, split=split, faults=faults)
     if not chosen:
         asked = f"{split} episode of {', '.join(robots)}" if robots else f"{split} episode"
         seeds = " --validation-seeds 4" if split == "validation" else ""

@@ -11,7 +11,7 @@ from xew.model.diffusion.samplers import SAMPLERS, SCHEDULES
 from xew.model.network.dit import STREAMS
 from xew.model.network.mechanisms import MECHANISMS
 from xew.model.settings.parts import pick_conditions
-from xew.model.settings.settings import AdaptSettings, ModelSettings, count_mixed
+from xew.model.settings.settings import AdaptSettings, ModelSettings, count_replayed
 from xew.model.video.frames import TEMPORAL_FACTOR
 
 LEAST_OF_STEPS: dict[str, float] = {
@@ -115,12 +115,11 @@ def _check_training(experiment: Any, source: str) -> None:
     check_steps(train.steps, train.epochs, "epochs", source)
     if train.ema > LONGEST_AVERAGE:
         raise ConfigError(f"{source}: train.ema is {train.ema:g} of the run; it must be at most {LONGEST_AVERAGE:g}.")
-    for name, part in (("train.faults", train.faults), ("adapt.replay", adapt.replay)):
-        if not 0 <= part < 1 or (part and count_mixed(train.batch, part) >= train.batch):
-            raise ConfigError(
-                f"{source}: {name} is {part:g} of a batch of {train.batch}; it must be a part below 1 that leaves at least one "
-                "other sample."
-            )
+    if not 0 <= adapt.replay < 1 or (adapt.replay and count_replayed(train.batch, adapt.replay) >= train.batch):
+        raise ConfigError(
+            f"{source}: adapt.replay is {adapt.replay:g} of a batch of {train.batch}; it must be a part below 1 that leaves at "
+            "least one other sample."
+        )
     if not train.shift > 0:
         raise ConfigError(f"{source}: train.shift is {train.shift:g}; it must be over 0 (1 leaves the levels as they are).")
     if adapt.start_from is None:
@@ -129,8 +128,6 @@ def _check_training(experiment: Any, source: str) -> None:
         return
     if not adapt.robots or adapt.episodes < 1:
         raise ConfigError(f"{source}: adapt needs adapt.robots and at least one of adapt.episodes of each task and robot.")
-    if train.faults:
-        raise ConfigError(f"{source}: train.faults is {train.faults:g}; an adaptation has no faulty episodes, set it to 0.")
 
 
 def _check_history(settings: ModelSettings, conditions: Sequence[Condition], source: str) -> None:

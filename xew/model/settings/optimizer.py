@@ -11,7 +11,7 @@ from jax.typing import DTypeLike
 from optax.contrib import MuonDimensionNumbers, muon
 
 from xew.model.devices.sharding import path_names
-from xew.model.settings.settings import TrainSettings, count_mixed
+from xew.model.settings.settings import TrainSettings, count_replayed
 
 WEIGHT_DECAY = 0.01
 """Weight decay, as in the paper."""
@@ -93,9 +93,9 @@ def average_decay(settings: TrainSettings) -> float:
     return 1 - 1 / max(settings.ema * settings.steps, 1)
 
 
-def set_steps(settings: TrainSettings, samples: int, mixed: float = 0.0) -> TrainSettings:
-    """The settings with `steps` set to `epochs` passes over `samples` fresh (not replayed or faulty) samples."""
+def set_steps(settings: TrainSettings, samples: int, replayed: float = 0.0) -> TrainSettings:
+    """The settings with `steps` set to `epochs` passes over `samples` fresh samples."""
     if not settings.epochs:
         return settings
-    fresh = settings.batch - count_mixed(settings.batch, mixed)
+    fresh = settings.batch - count_replayed(settings.batch, replayed)
     return replace(settings, steps=max(1, math.ceil(settings.epochs * samples / fresh)))

@@ -77,8 +77,6 @@ class EpisodeChoice:
     """Number of episodes of each task and robot in an adaptation; 0 takes all."""
     replay: tuple[str, ...] = ()
     """Replayed robots of an adaptation."""
-    faults: bool = False
-    """Whether faulty episodes are mixed in."""
     samples: Mapping[str, str] = field(default_factory=dict)
     """Roles (seen, unseen or target) of the robots in sample videos."""
     motion: str = SHARED_MOTION
@@ -92,8 +90,8 @@ class TrainSpec:
     network: Network
     inputs: ClipInputs
     settings: TrainSettings
-    mixed: float = 0.0
-    """Part of every batch from replayed or faulty episodes."""
+    replayed: float = 0.0
+    """Part of every batch from replayed episodes."""
     lora_rank: int = 0
     """Rank of the LoRA corrections; 0 trains all weights."""
 
@@ -103,7 +101,7 @@ class TrainSpec:
 
     def with_steps(self, samples: int) -> "TrainSpec":
         """The same with `steps` set for this number of fresh training samples."""
-        return replace(self, settings=set_steps(self.settings, samples, self.mixed))
+        return replace(self, settings=set_steps(self.settings, samples, self.replayed))
 
 
 def pick_conditions(settings: ModelSettings) -> list[Condition]:

@@ -52,8 +52,6 @@ class TrainSettings:
     epochs: float = 0.0
     """Number of passes over the training samples; 0 if `steps` sets the length."""
     seed: int = 0
-    faults: float = 0.0
-    """Part of every batch from episodes of faulty commands, which `generate --faults` makes; 0 trains on the experts' alone."""
     optimizer: Literal["adamw", "muon"] = "muon"
     """AdamW as in the paper, or Muon for the matrices of the blocks and AdamW for the rest."""
     learning_rate: float = 2e-3
@@ -121,6 +119,6 @@ class RolloutSettings:
     seed: int = 0
 
 
-def count_mixed(batch: int, part: float) -> int:
-    """Number of replayed or faulty samples of a batch: the nearest integer, at least one if their part is positive."""
+def count_replayed(batch: int, part: float) -> int:
+    """Number of replayed samples of a batch: the nearest integer, at least one if their part is positive."""
     return max(1, round(batch * part)) if part else 0

@@ -38,7 +38,7 @@ class Batch:
 class ClipSource:
     """Random access to the training samples of the cache, for Grain: index -> Batch without its leading axis.
 
-    Samples of `episodes` come first, then those of `mixed`. Text is [l e] float32 or [l] int32 by instruction.
+    Samples of `episodes` come first, then those of `replayed`. Text is [l e] float32 or [l] int32 by instruction.
     """
 
     def __init__(
@@ -47,20 +47,20 @@ class ClipSource:
         text: Mapping[str, np.ndarray],
         scales: Mapping[str, Scale],
         episodes: Sequence[Episode],
-        mixed: Sequence[Episode] = (),
+        replayed: Sequence[Episode] = (),
     ) -> None:
         self.cache, self.text, self.scales = cache, text, scales
         self.samples = [sample for _, record in episodes for sample in self._list_samples(record)]
         self.fresh = len(self.samples)
-        self.samples += [sample for _, record in mixed for sample in self._list_samples(record)]
+        self.samples += [sample for _, record in replayed for sample in self._list_samples(record)]
 
     @classmethod
     def open(
-        cls, encoding: Encoding, instructions: Instructions, episodes: Sequence[Episode], mixed: Sequence[Episode] = ()
+        cls, encoding: Encoding, instructions: Instructions, episodes: Sequence[Episode], replayed: Sequence[Episode] = ()
     ) -> "ClipSource":
         """Open the cache of these episodes. Raises ConfigError if scales were never fitted on them."""
-        text = instructions.encode(record.instruction for _, record in (*episodes, *mixed))
-        return cls(open_cache(encoding), text, load_scales(encoding, episodes), episodes, mixed)
+        text = instructions.encode(record.instruction for _, record in (*episodes, *replayed))
+        return cls(open_cache(encoding), text, load_scales(encoding, episodes), episodes, replayed)
 
     def _list_samples(self, record: Record) -> list[tuple[Record, tuple[int, ...]]]:
         inputs = self.cache.encoding.inputs

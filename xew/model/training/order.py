@@ -6,7 +6,7 @@ import grain
 import numpy as np
 
 from xew.concurrency import usable_cores
-from xew.model.settings.settings import count_mixed
+from xew.model.settings.settings import count_replayed
 from xew.model.training.data import Batch, ClipSource, stack
 
 PASSES = 2**40
@@ -19,7 +19,7 @@ def make_dataset(
     source: ClipSource,
     batch: int,
     seed: int,
-    mixed: float = 0.0,
+    replayed: float = 0.0,
     own: np.ndarray | None = None,
     place: Callable[[Batch], Batch] = lambda batch: batch,
 ) -> grain.IterDataset:
@@ -29,11 +29,11 @@ def make_dataset(
         source: of the samples.
         batch: number of samples over all processes.
         seed: of the order.
-        mixed: part of each batch from the source's replayed or faulty episodes.
+        replayed: part of each batch from the source's replayed episodes.
         own: [b] indices of the samples of each batch that this process loads, by default all.
         place: function that moves a batch to the devices, called in the threads that read.
     """
-    count = count_mixed(batch, mixed)
+    count = count_replayed(batch, replayed)
     fresh = _shuffle(range(source.fresh), seed, batch - count)
     others = _shuffle(range(source.fresh, len(source)), seed + 1, count) if count else None
     own = np.arange(batch) if own is None else own
