@@ -14,7 +14,15 @@ from typing import Any, TypeVar
 import cv2
 import jax
 
-from xew.concurrency import free_gpu_memory, map_in_order, map_in_processes, map_with_shared_memory, queue_to, visible_gpus
+from xew.concurrency import (
+    free_gpu_memory,
+    map_in_order,
+    map_in_processes,
+    map_with_shared_memory,
+    queue_to,
+    reuse_memory,
+    visible_gpus,
+)
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -91,6 +99,7 @@ def _open_reader(read: Callable[[Item], Result]) -> Callable[[Item], Result]:
     from xew.sim_warp.devices.workers import find_device, keep_memory, quiet_warp
     from xew.sim_warp.rendering.streams import default_renderer
 
+    reuse_memory()
     quiet_warp()
     device = find_device(None)
     default_renderer(FRAMES_OF_READER if device.is_cuda else None)
