@@ -44,7 +44,7 @@ MOST_KEPT = 2**31 - 1
 def reuse_memory() -> None:
     """Let this process keep the memory of arrays that it frees for its next ones, if the C library is glibc.
 
-    By default it returns large ones to the system, which clears every page of the next one. This takes 0.35 s of a core for each
+    By default it returns large ones to the system, which clears every page of the next one. This takes 0.35 s of a core for an
     episode that is read and cut.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
