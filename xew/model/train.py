@@ -111,7 +111,7 @@ def train(experiment: Experiment, *, resume: bool = False, overwrite: bool = Fal
     settings = spec.settings
     codec = source.cache.codec
     trainer = make_trainer(spec, mesh, codec)
-    batches = iter(make_dataset(source, settings.batch, settings.seed, spec.replayed, own, trainer.place))
+    batches = iter(make_dataset(source, settings.batch, settings.seed, spec.replay, own, trainer.place))
     check_memory(estimate_memory(trainer, experiment.encoding), ignore=ignore_memory)
 
     trained = (*episodes.fresh, *episodes.replayed)

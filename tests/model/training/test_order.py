@@ -24,10 +24,10 @@ def test_batches_without_replay_are_those_of_earlier_versions() -> None:
 
 
 def test_batches_with_replay_go_on_where_they_stopped() -> None:
-    batches = iter(make_dataset(Numbers(), 4, seed=0, replayed=0.25))  # type: ignore[arg-type]
+    batches = iter(make_dataset(Numbers(), 4, seed=0, replay=0.25))  # type: ignore[arg-type]
     drawn, position = [next(batches).latents for _ in range(6)], batches.get_state()
     assert [(batch >= 10).tolist() for batch in drawn] == [[False, False, False, True]] * 6
-    continued = iter(make_dataset(Numbers(), 4, seed=0, replayed=0.25))  # type: ignore[arg-type]
+    continued = iter(make_dataset(Numbers(), 4, seed=0, replay=0.25))  # type: ignore[arg-type]
     continued.set_state(position)
     for _ in range(3):
         np.testing.assert_array_equal(next(continued).latents, next(batches).latents)

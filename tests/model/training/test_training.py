@@ -501,7 +501,7 @@ def test_replay_is_a_part_of_every_batch(world: Path, experiment: Experiment) ->
             return Batch(np.array(self.samples[index][0].robot == "piper"), {}, np.array(index))
 
     source = Names.open(adapted.encoding, adapted.instructions, new, old)
-    batches = iter(make_dataset(source, 8, seed=0, replayed=0.25))
+    batches = iter(make_dataset(source, 8, seed=0, replay=0.25))
     drawn = [next(batches) for _ in range(6)]
     assert all(batch.latents.sum() == 6 for batch in drawn)
     assert len({int(index) for batch in drawn for index in batch.text[6:]}) == 12, "replay goes on through its episodes"

@@ -93,9 +93,9 @@ def average_decay(settings: TrainSettings) -> float:
     return 1 - 1 / max(settings.ema * settings.steps, 1)
 
 
-def set_steps(settings: TrainSettings, samples: int, replayed: float = 0.0) -> TrainSettings:
+def set_steps(settings: TrainSettings, samples: int, replay: float = 0.0) -> TrainSettings:
     """The settings with `steps` set to `epochs` passes over `samples` fresh samples."""
     if not settings.epochs:
         return settings
-    fresh = settings.batch - count_replayed(settings.batch, replayed)
+    fresh = settings.batch - count_replayed(settings.batch, replay)
     return replace(settings, steps=max(1, math.ceil(settings.epochs * samples / fresh)))

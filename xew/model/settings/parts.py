@@ -90,7 +90,7 @@ class TrainSpec:
     network: Network
     inputs: ClipInputs
     settings: TrainSettings
-    replayed: float = 0.0
+    replay: float = 0.0
     """Part of every batch from replayed episodes."""
     lora_rank: int = 0
     """Rank of the LoRA corrections; 0 trains all weights."""
@@ -101,7 +101,7 @@ class TrainSpec:
 
     def with_steps(self, samples: int) -> "TrainSpec":
         """The same with `steps` set for this number of fresh training samples."""
-        return replace(self, settings=set_steps(self.settings, samples, self.replayed))
+        return replace(self, settings=set_steps(self.settings, samples, self.replay))
 
 
 def pick_conditions(settings: ModelSettings) -> list[Condition]:

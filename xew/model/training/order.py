@@ -19,7 +19,7 @@ def make_dataset(
     source: ClipSource,
     batch: int,
     seed: int,
-    replayed: float = 0.0,
+    replay: float = 0.0,
     own: np.ndarray | None = None,
     place: Callable[[Batch], Batch] = lambda batch: batch,
 ) -> grain.IterDataset:
@@ -29,11 +29,11 @@ def make_dataset(
         source: of the samples.
         batch: number of samples over all processes.
         seed: of the order.
-        replayed: part of each batch from the source's replayed episodes.
+        replay: part of each batch from the source's replayed episodes.
         own: [b] indices of the samples of each batch that this process loads, by default all.
         place: function that moves a batch to the devices, called in the threads that read.
     """
-    count = count_replayed(batch, replayed)
+    count = count_replayed(batch, replay)
     fresh = _shuffle(range(source.fresh), seed, batch - count)
     others = _shuffle(range(source.fresh, len(source)), seed + 1, count) if count else None
     own = np.arange(batch) if own is None else own
