@@ -9,9 +9,10 @@ import yaml
 
 from tests.analysis.studies.chains import ROOT
 from xew.analysis.studies.config import build_experiment, load_study
-from xew.analysis.studies.cost import RECIPE
-from xew.config import CONVERTER, read_yaml
+from xew.analysis.studies.cost import RECIPE, relative_work
+from xew.config import CONVERTER, parse, read_yaml
 from xew.model.experiment import Experiment, load_experiment
+from xew.model.training.flops import flops_of_step
 from xew.protocol import Variant
 
 PLACES = {"data", "out", "cache"}
@@ -99,3 +100,15 @@ def test_costs_know_the_defaults_of_experiments() -> None:
     settings = CONVERTER.unstructure(recipe)
     for section, values in RECIPE.items():
         assert values.items() <= settings[section].items()
+
+
+def test_the_cost_of_training_knows_the_tokens_of_variants() -> None:
+    def work(experiment: Mapping[str, Any]) -> float:
+        spec = parse(Experiment, experiment, "variant").spec
+        return flops_of_step(spec) / spec.settings.batch
+
+    study = load_study(ROOT / "configs" / "study_small.yaml", ["--parts", "actions", "ladder", "loeo", "few_shot"])
+    recommended = work({**read_yaml(study.experiment), "data": "data", "out": "out"})
+    assert len(study.planned_runs) > 10
+    for run in study.planned_runs:
+        assert work(build_experiment(study, run)) / recommended == pytest.approx(relative_work(run), rel=0.05)

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from xew.episode import project
-from xew.metrics.outcome.poses import Bodies, Hands, Lens, follow_bodies
+from xew.metrics.outcome.poses import Body, Hands, Lens, follow_body
 
 T = 24
 INTRINSICS = np.array([[360.0, 0, 159.5], [0, 360.0, 119.5], [0, 0, 1]])
@@ -55,11 +55,11 @@ def follow(
     if lost is not None:
         tracks[10:, lost] = np.nan
     visible = np.isfinite(tracks).all(axis=-1) if hidden else np.ones(tracks.shape[:2], bool)
-    bodies = Bodies(true[:1], np.array([lid]), np.array([[0, 0.05, 0]]), np.array([[-1.0, 0, 0]]))
+    body = Body(true[0], np.array(lid), np.array([0, 0.05, 0]), np.array([-1.0, 0, 0]))
     away = np.stack([pose(9, 9, 9)] * T)
     hands = Hands(np.stack([[hand(t) for t in range(T)], away], axis=1), np.arange(T)[:, None] >= [closed, T])
     lens = Lens(INTRINSICS, np.broadcast_to(EXTRINSICS, (T, 4, 4)))
-    return np.asarray(follow_bodies(tracks, visible, LOCAL, np.zeros(len(LOCAL), int), bodies, hands, lens))[:, 0]
+    return np.asarray(follow_body(tracks, visible, LOCAL, body, hands, lens))
 
 
 @pytest.mark.parametrize(

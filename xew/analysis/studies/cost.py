@@ -17,7 +17,13 @@ from xew.analysis.studies.machines import usable_gpus
 from xew.analysis.studies.plan import Step, count_gpus, count_sharing, generate_name, measured_bodies, sort_steps
 from xew.analysis.studies.rates import Rate, Source, find_rates
 from xew.config import merge_settings, read_yaml
+from xew.model.conditions import ACTIONS, CONDITIONS, list_conditions
 from xew.protocol import BASELINES, ROBOT_NAMES, Variant, training_counts
+
+OWN_TOKENS = ("action", "embodiment")
+"""Streams of the network that have as many tokens as the video; other conditions are channels or few tokens."""
+PAIRS = 0.28
+"""Part of the FLOPs of `small` without such streams that grows with pairs of tokens, not with tokens."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +34,7 @@ class Cost:
     unit: str
     rate: Rate
     items: float
-    """Number of items that the rate counts: of a training run the samples of all batches."""
+    """Number of items that the rate counts: of a training run the samples of all batches, as if of the recommended recipe."""
     disk_mb: float = 0.0
 
     def seconds(self, gpus: int = 1) -> float:
@@ -51,7 +57,7 @@ def estimate(study: Study, steps: Mapping[str, Step]) -> dict[str, Cost]:
     """The cost of every step from the study's rates, as if nothing were done."""
     rates, costs = study_rates(study), dict[str, Cost]()
 
-    def add(name: str, amount: int, unit: str, items: int | None = None, stored: int | None = None) -> None:
+    def add(name: str, amount: int, unit: str, items: float | None = None, stored: int | None = None) -> None:
         """Note the cost of a step; `stored` is the number of products on disk, by default one an item."""
         items = amount if items is None else items
         rate = rates.kinds[name.partition("/")[0].replace("adapt", "train")]
@@ -63,7 +69,7 @@ def estimate(study: Study, steps: Mapping[str, Step]) -> dict[str, Cost]:
     for variant in study.planned_runs:
         experiment = build_experiment(study, variant)
         updates, graded = count_optimizer_steps(study, variant, experiment), sum(study.graded_counts(variant).values())
-        samples = updates * merge_settings(RECIPE, experiment)["train"]["batch"]
+        samples = updates * merge_settings(RECIPE, experiment)["train"]["batch"] * relative_work(variant)
         add(f"latents/{variant.name}", _count_new_streams(study, variant, experiment, encoded), "streams")
         add(f"{'adapt' if variant.target else 'train'}/{variant.name}", updates, "steps", samples, stored=1)
         add(f"rollout/{variant.name}", graded, "episodes")
@@ -78,6 +84,14 @@ def estimate(study: Study, steps: Mapping[str, Step]) -> dict[str, Cost]:
     add("distances", math.comb(len(ROBOT_NAMES) + len(measured_bodies(study)), 2), "pairs")
     add("analyse", 1, "report")
     return {name: costs[name] for name in steps}
+
+
+def relative_work(variant: Variant) -> float:
+    """FLOPs of a training sample relative to those of the recommended recipe, whose conditions are channels."""
+    conditions = (*list_conditions(ACTIONS[variant.action]), *list_conditions(CONDITIONS[variant.embodiment]))
+    own = sum(condition.stream in OWN_TOKENS for condition in conditions)
+    pairs = 1 + own + own**2  # the video sees all, conditions see only conditions
+    return (1 - PAIRS) * (1 + own) + PAIRS * pairs
 
 
 def _count_new_streams(study: Study, variant: Variant, experiment: Settings, encoded: dict[tuple[str, ...], int]) -> int:

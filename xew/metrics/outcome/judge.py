@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from xew.episode import Record, States
 from xew.metrics.metric import fill_up
-from xew.metrics.outcome.poses import REACH, Bodies, Hands, Lens, follow_bodies
+from xew.metrics.outcome.poses import REACH, Body, Hands, Lens, follow_body
 from xew.metrics.outcome.variants import CommandVariants, Variant
 from xew.protocol import ARMS
 
@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from xew.sim_warp.scene import Hinge, Scene
     from xew.sim_warp.tasks import Task
 
-FRAME_BLOCK, POINT_BLOCK, BODY_BLOCK = 64, 32, 4
-"""Numbers of frames, points and bodies that episodes are filled up to multiples of, so they share a few compiled programs."""
+FRAME_BLOCK, POINT_BLOCK = 64, 16
+"""Numbers of frames and points that tracks are filled up to multiples of, so they share a few compiled programs."""
 OPEN = 0.8
 """Command of a gripper from which on it holds nothing."""
 UNJUDGED = ("place_dual_shoes", "place_mouse_pad", "press_stapler")
@@ -76,11 +76,17 @@ class Outcome:
             tracks: [t k 2] pixels, NaN where a point is lost.
             visible: [t k] bool, where it should be seen.
         """
-        points = [fill_up(array, 0, POINT_BLOCK, value) for array, value in ((self.local, 0), (self.part, -1))]
-        filled = [fill_up(fill_up(array, 1, POINT_BLOCK, 0), 0, FRAME_BLOCK, 0) for array in (tracks, visible)]
         with jax.default_device(jax.local_devices(backend="cpu")[0]):  # tracks are small
-            poses = follow_bodies(*filled, *points, *self._known(len(tracks)))
-        return np.asarray(poses)[: len(tracks), : len(self.parts)]
+            hands, lens = self._known(len(tracks))
+            poses = [follow_body(*self._points_of(i, tracks, visible), self._body(i), hands, lens) for i in range(len(self.parts))]
+        return np.stack(poses, axis=1)[: len(tracks)]
+
+    def _points_of(self, part: int, tracks: np.ndarray, visible: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Tracks [t k 2] pixels, visibility [t k] and places [k 3] m of the points on a part, filled up."""
+        own = self.part == part
+        tracks, visible = (fill_up(array[:, own], 1, POINT_BLOCK, 0) for array in (tracks, visible))
+        local = fill_up(self.local[own], 0, POINT_BLOCK, 0)
+        return fill_up(tracks, 0, FRAME_BLOCK, 0), fill_up(visible, 0, FRAME_BLOCK, 0), local
 
     def true_poses(self, frames: int) -> np.ndarray:
         """Poses [t p 4 4] of the parts in the simulator."""
@@ -139,23 +145,30 @@ class Outcome:
         bodies = [part.index if part.hinge is None else len(self.scene.objects) + lids.index(part.index) for part in self.parts]
         return matrix_from_pose(pose[:, bodies])
 
-    def _known(self, frames: int) -> tuple[Bodies, Hands, Lens]:
-        """What the poses of the first frames rest on."""
+    def _body(self, part: int) -> Body:
+        """What the poses of a part rest on."""
+        from xew.sim_warp.geometry.poses import matrix_from_pose
+
+        start, hinge = self._start[part], self.parts[part].hinge
+        if hinge is None:
+            return Body(start, np.array(False), *np.zeros((2, 3)))
+        base = matrix_from_pose(self.states.object_pose[0, self.parts[part].index])
+        anchor, axis = base[:3, :3] @ hinge.anchor + base[:3, 3], base[:3, :3] @ hinge.axis
+        return Body(start, np.array(True), anchor, axis / np.linalg.norm(hinge.axis))
+
+    @cached_property
+    def _start(self) -> np.ndarray:
+        """Poses [p 4 4] of the parts in the first frame, world."""
+        return self.poses_of(self.states)[0]
+
+    def _known(self, frames: int) -> tuple[Hands, Lens]:
+        """Hands and camera in the first frames, filled up."""
         from xew.sim_warp.geometry.poses import matrix_from_pose
 
         states, frame = self.states, fill_up(np.arange(frames), 0, FRAME_BLOCK)
-        anchor, axis = np.zeros((2, len(self.parts), 3))
-        for i, part in enumerate(self.parts):
-            if part.hinge is not None:
-                base = matrix_from_pose(states.object_pose[0, part.index])
-                anchor[i] = base[:3, :3] @ part.hinge.anchor + base[:3, 3]
-                axis[i] = base[:3, :3] @ part.hinge.axis / np.linalg.norm(part.hinge.axis)
-        start = self.poses_of(states)[0]
-        hinged = np.array([part.hinge is not None for part in self.parts], bool)
-        bodies = Bodies(*(fill_up(array, 0, BODY_BLOCK) for array in (start, hinged, anchor, axis)))
         extrinsics = np.broadcast_to(states.extrinsics, (len(states.action), 4, 4))[frame]
         hands = Hands(matrix_from_pose(states.tool_pose[frame]), self._gripper[frame] < OPEN)
-        return bodies, hands, Lens(states.intrinsics, extrinsics)
+        return hands, Lens(states.intrinsics, extrinsics)
 
     @property
     def _gripper(self) -> np.ndarray:

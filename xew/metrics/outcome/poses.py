@@ -44,16 +44,16 @@ ITERATIONS = 6
 """Number of Gauss-Newton steps in a frame."""
 
 
-class Bodies(NamedTuple):
-    """Objects and lids whose poses are estimated."""
+class Body(NamedTuple):
+    """An object or a lid whose pose is estimated."""
 
-    start: Float[AnyArray, "o 4 4"]
-    """Their poses in the first frame, world."""
-    hinged: Bool[AnyArray, " o"]
-    """Whether each is a lid."""
-    anchor: Float[AnyArray, "o 3"]
+    start: Float[AnyArray, "4 4"]
+    """Its pose in the first frame, world."""
+    hinged: Bool[AnyArray, ""]
+    """Whether it is a lid."""
+    anchor: Float[AnyArray, "3"]
     """A point of a lid's axis, world [m]."""
-    axis: Float[AnyArray, "o 3"]
+    axis: Float[AnyArray, "3"]
     """Direction of a lid's axis, world."""
 
 
@@ -80,51 +80,45 @@ class _Seen(NamedTuple):
     track: jax.Array
     """[k 2] pixels."""
     local: jax.Array
-    """[k 3] m, in the frames of their bodies."""
+    """[k 3] m, in the frame of the body."""
     intrinsics: jax.Array
     extrinsics: jax.Array
 
 
 @jax.jit
-def follow_bodies(
+def follow_body(
     tracks: Float[AnyArray, "t k 2"],
     visible: Bool[AnyArray, "t k"],
     local: Float[AnyArray, "k 3"],
-    body: Int[AnyArray, " k"],
-    bodies: Bodies,
+    body: Body,
     hands: Hands,
     lens: Lens,
-) -> Float[jax.Array, "t o 4 4"]:
-    """Poses of bodies in every frame, world.
+) -> Float[jax.Array, "t 4 4"]:
+    """Poses of a body in every frame, world.
 
     Args:
-        tracks: tracked points [pixels], NaN where lost.
+        tracks: tracked points on it [pixels], NaN where lost.
         visible: where each should be seen.
-        local: their places in the frames of their bodies [m].
-        body: the number of the body of each, -1 for none.
-        bodies, hands, lens: what is known of them.
+        local: their places in the body's frame [m].
+        body, hands, lens: what is known.
 
     Returns:
-        [t o 4 4] float32.
+        [t 4 4] float32.
     """
-    bodies, hands, lens = jax.tree.map(_in_float32, (bodies, hands, lens))
+    body, hands, lens = jax.tree.map(_in_float32, (body, hands, lens))
     points = _in_float32(local)
-    count = len(bodies.start)
-    own = jnp.asarray(body)[None] == jnp.arange(count)[:, None]
 
     def step(carry: Any, now: Any) -> tuple[Any, jax.Array]:
         pose, mover, before = carry
         track, seen, hand, closing, extrinsics = now
-        found = own & (seen & jnp.isfinite(track).all(axis=-1))[None]
-        found_count, seen_count = (jnp.sum(flags, axis=1, dtype=jnp.float32) for flags in (found, own & seen[None]))
-        missed = found_count < FEWEST_FOUND * seen_count
+        found = seen & jnp.isfinite(track).all(axis=-1)
+        missed = jnp.sum(found, dtype=jnp.float32) < FEWEST_FOUND * jnp.sum(seen, dtype=jnp.float32)
         moved = hand @ jnp.linalg.inv(before)
-        seen_points = _Seen(jnp.nan_to_num(track), points, jnp.asarray(lens.intrinsics), extrinsics)
-        follow = functools.partial(_follow, seen_points, (moved, before, closing))
-        pose, mover = jax.vmap(follow)(found & ~missed[:, None], missed, pose, mover, bodies)
+        seen_points = _Seen(jnp.nan_to_num(track), points, lens.intrinsics, extrinsics)
+        pose, mover = _follow(seen_points, (moved, before, closing), found & ~missed, missed, pose, mover, body)
         return (pose, mover, hand), pose
 
-    start = bodies.start, jnp.zeros(count, int), hands.pose[0]
+    start = body.start, jnp.zeros((), int), hands.pose[0]
     frames = _in_float32(tracks), jnp.asarray(visible), hands.pose, hands.closing, lens.extrinsics
     poses: jax.Array = lax.scan(step, start, frames)[1]
     return poses
@@ -143,9 +137,9 @@ def _follow(
     missed: jax.Array,
     pose: jax.Array,
     mover: jax.Array,
-    body: Bodies,
+    body: Body,
 ) -> tuple[jax.Array, jax.Array]:
-    """The pose of one body in a frame and who moves it, from both in the frame before.
+    """The pose of a body in a frame and who moves it, from both in the frame before.
 
     It is moved by nobody yet (0), the left (1) or the right hand (2), or nobody any more (3).
     """
@@ -173,43 +167,69 @@ def _fit(points: _Seen, found: jax.Array, anchor: jax.Array, pose: jax.Array, sp
     """The pose near an expected one that fits the found points best, and its cost in squared standard deviations.
 
     Args:
-        points: of all bodies.
+        points: on the body.
         found: [k] bool, which of them count.
         anchor: [3] the point that the body turns about; NaN for its origin.
         pose: [4 4] where it is expected.
         spread: [6 6] as of `_spread`.
     """
 
-    def off(pose: jax.Array) -> jax.Array:
-        """[k 2] how far the points are from where a pose has them, in standard deviations."""
-        return (points.track - _project(points, pose)) / PIXEL
-
     def step(state: tuple[jax.Array, jax.Array], _: None) -> tuple[tuple[jax.Array, jax.Array], None]:
         pose, deviation = state
-        slope = -jax.jacfwd(lambda change: off(_move(pose, anchor, spread @ change)))(jnp.zeros(6))
-        left = off(pose)
+        left = _off(points, pose)
         weight = jnp.where(found, 1 / jnp.maximum(jnp.linalg.norm(left, axis=-1) / OUTLIER, 1), 0)
-        normal = jnp.einsum("kpi,k,kpj->ij", slope, weight, slope) + jnp.eye(6)
-        change = jnp.linalg.solve(normal, jnp.einsum("kpi,k,kp->i", slope, weight, left) - deviation)
+        slope = jnp.einsum("kpi,ij->kpj", _slope(points, pose, anchor), spread) / PIXEL
+        weighted = weight[:, None, None] * slope
+        normal = jnp.einsum("kpi,kpj->ij", weighted, slope) + jnp.eye(6)
+        change = jnp.linalg.solve(normal, jnp.einsum("kpi,kp->i", weighted, left) - deviation)
         return (_move(pose, anchor, spread @ change), deviation + change), None
 
     (pose, deviation), _ = lax.scan(step, (pose, jnp.zeros(6)), None, ITERATIONS)
-    far = jnp.linalg.norm(off(pose), axis=-1)
+    far = jnp.linalg.norm(_off(points, pose), axis=-1)
     huber = jnp.where(far < OUTLIER, far**2, OUTLIER * (2 * far - OUTLIER))
     return pose, jnp.sum(jnp.where(found, huber, 0)) + jnp.sum(deviation**2)
 
 
-def _project(points: _Seen, pose: jax.Array) -> jax.Array:
-    """Pixels [k 2] of points on a body at a pose [4 4]."""
-    to_camera = points.extrinsics @ pose
-    seen = points.local @ to_camera[:3, :3].T + to_camera[None, :3, 3]
-    pixels = seen @ points.intrinsics.T / jnp.maximum(seen[:, 2:], NEAREST)
-    return pixels[:, :2]
+def _off(points: _Seen, pose: jax.Array) -> jax.Array:
+    """[k 2] how far the points are from where a pose [4 4] has them, in standard deviations."""
+    seen = _place(points.extrinsics @ pose, points.local)
+    return (points.track - _project(points, seen)) / PIXEL
+
+
+def _slope(points: _Seen, pose: jax.Array, anchor: jax.Array) -> jax.Array:
+    """Derivatives [k 2 6] of the pixels of points on a body with respect to a twist (`_move`) where it is zero."""
+    world = _place(pose, points.local)
+    arm = world - _pivot(pose, anchor)[None]
+    turned = jnp.cross(jnp.eye(3)[None], arm[:, None])
+    moved = jnp.concatenate([turned, jnp.broadcast_to(jnp.eye(3)[None], turned.shape)], axis=1)
+    seen = _place(points.extrinsics, world)
+    nearing = jnp.where(seen[:, 2:] > NEAREST, _project(points, seen), 0)
+    shown = points.intrinsics[None, :2] - nearing[..., None] * points.intrinsics[None, 2:]
+    return jnp.einsum("kpc,cw,kiw->kpi", shown / _depth(seen)[..., None], points.extrinsics[:3, :3], moved)
+
+
+def _place(pose: jax.Array, local: jax.Array) -> jax.Array:
+    """Places [k 3] of points in the frame that a pose [4 4] is of."""
+    return local @ pose[:3, :3].T + pose[None, :3, 3]
+
+
+def _project(points: _Seen, seen: jax.Array) -> jax.Array:
+    """Pixels [k 2] of places [k 3] m in the camera's frame."""
+    return seen @ points.intrinsics[:2].T / _depth(seen)
+
+
+def _depth(seen: jax.Array) -> jax.Array:
+    return jnp.maximum(seen[:, 2:], NEAREST)
 
 
 def _move(pose: jax.Array, anchor: jax.Array, twist: jax.Array) -> jax.Array:
     """A pose [4 4] turned about an anchor [3], or its origin if that is NaN, and moved: by a twist [6], rad and m, world."""
-    pivot = jnp.where(jnp.isnan(anchor), pose[:3, 3], anchor)
+    pivot = _pivot(pose, anchor)
     turn = Rotation.from_quat(jnp.append(twist[:3] / 2, 1)).as_matrix()  # of small turns, and smooth at none
     place = pivot + turn @ (pose[:3, 3] - pivot) + twist[3:]
     return jnp.eye(4).at[:3, :3].set(turn @ pose[:3, :3]).at[:3, 3].set(place)
+
+
+def _pivot(pose: jax.Array, anchor: jax.Array) -> jax.Array:
+    """The point [3] that a body turns about."""
+    return jnp.where(jnp.isnan(anchor), pose[:3, 3], anchor)
