@@ -2,11 +2,14 @@
 
 from collections.abc import Callable
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from xew.episode import project
+from xew.metrics.outcome import poses
 from xew.metrics.outcome.poses import Body, Hands, Lens, follow_body
 
 T = 24
@@ -97,3 +100,21 @@ def test_a_lid_keeps_its_axis() -> None:
     found = follow(swing, lid=True)
     on_axis = found[:, :3, :3] @ [0.2, 0.05, 0] + found[:, :3, 3]
     np.testing.assert_allclose(on_axis, np.tile([0.2, 0.05, 0], (T, 1)), atol=1e-5)
+
+
+@pytest.mark.parametrize("anchor", [(np.nan,) * 3, (0.0, 0.05, 0.0)])
+@pytest.mark.parametrize("near", [False, True])
+def test_derivatives_are_those_of_projected_motions(anchor: tuple[float, ...], near: bool) -> None:
+    to_camera = EXTRINSICS.copy()
+    to_camera[2, 3] -= 0.95 if near else 0  # then some points are nearer than NEAREST
+    seen = poses._Seen(*(jnp.asarray(array, jnp.float32) for array in (np.zeros((12, 2)), LOCAL, INTRINSICS, to_camera)))
+    start, pivot = jnp.asarray(slide(3), jnp.float32), jnp.asarray(anchor, jnp.float32)
+
+    def pixels(twist: jax.Array) -> jax.Array:
+        moved = poses._move(start, pivot, twist)
+        return poses._project(seen, poses._place(seen.extrinsics @ moved, seen.local))
+
+    expected = jax.jacfwd(pixels)(jnp.zeros(6))
+    np.testing.assert_allclose(
+        poses._slope(seen, start, pivot), expected, rtol=1e-4, atol=1e-5 * float(jnp.abs(expected).max())
+    )

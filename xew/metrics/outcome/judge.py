@@ -78,7 +78,8 @@ class Outcome:
         """
         with jax.default_device(jax.local_devices(backend="cpu")[0]):  # tracks are small
             hands, lens = self._known(len(tracks))
-            poses = [follow_body(*self._points_of(i, tracks, visible), self._body(i), hands, lens) for i in range(len(self.parts))]
+            parts = range(len(self.parts))
+            poses = [follow_body(*self._points_of(part, tracks, visible), self._body(part), hands, lens) for part in parts]
         return np.stack(poses, axis=1)[: len(tracks)]
 
     def _points_of(self, part: int, tracks: np.ndarray, visible: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.scipy.spatial.transform import Rotation
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from xew.metrics.metric import AnyArray
 
@@ -114,7 +114,7 @@ def follow_body(
         found = seen & jnp.isfinite(track).all(axis=-1)
         missed = jnp.sum(found, dtype=jnp.float32) < FEWEST_FOUND * jnp.sum(seen, dtype=jnp.float32)
         moved = hand @ jnp.linalg.inv(before)
-        seen_points = _Seen(jnp.nan_to_num(track), points, lens.intrinsics, extrinsics)
+        seen_points = _Seen(jnp.nan_to_num(track), points, jnp.asarray(lens.intrinsics), extrinsics)
         pose, mover = _follow(seen_points, (moved, before, closing), found & ~missed, missed, pose, mover, body)
         return (pose, mover, hand), pose
 
