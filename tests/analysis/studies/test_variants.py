@@ -9,8 +9,8 @@ import yaml
 
 from tests.analysis.studies.chains import ROOT
 from xew.analysis.studies.config import build_experiment, load_study
-from xew.analysis.studies.cost import RECIPE, relative_work
-from xew.config import CONVERTER, parse, read_yaml
+from xew.analysis.studies.cost import RECIPE, read_model, work_of_sample
+from xew.config import CONVERTER, merge_settings, parse, read_yaml
 from xew.model.experiment import Experiment, load_experiment
 from xew.model.training.flops import flops_of_step
 from xew.protocol import Variant
@@ -102,13 +102,16 @@ def test_costs_know_the_defaults_of_experiments() -> None:
         assert values.items() <= settings[section].items()
 
 
-def test_the_cost_of_training_knows_the_tokens_of_variants() -> None:
-    def work(experiment: Mapping[str, Any]) -> float:
-        spec = parse(Experiment, experiment, "variant").spec
+@pytest.mark.parametrize("name", ["small", "paper"])
+def test_the_cost_of_training_knows_the_tokens_of_variants(name: str) -> None:
+    def work(settings: Mapping[str, Any]) -> float:
+        spec = parse(Experiment, {"data": "data", "out": "out", **settings}, "variant").spec
         return flops_of_step(spec) / spec.settings.batch
 
-    study = load_study(ROOT / "configs" / "study_small.yaml", ["--parts", "actions", "ladder", "loeo", "few_shot"])
-    recommended = work({**read_yaml(study.experiment), "data": "data", "out": "out"})
+    study = load_study(ROOT / "configs" / f"study_{name}.yaml", ["--parts", "actions", "ladder", "loeo"])
+    experiment = read_yaml(study.experiment)
     assert len(study.planned_runs) > 10
     for run in study.planned_runs:
-        assert work(build_experiment(study, run)) / recommended == pytest.approx(relative_work(run), rel=0.05)
+        settings = build_experiment(study, run)
+        estimated = work_of_sample(merge_settings(RECIPE, settings)["model"]) / work_of_sample(read_model(study))
+        assert estimated == pytest.approx(work(settings) / work(experiment), rel=0.2)

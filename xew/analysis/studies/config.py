@@ -45,7 +45,12 @@ Settings = dict[str, Any]
 
 RECIPE: Settings = {
     "clip": {"frames": 33},
-    "model": {"size": "small"},
+    "model": {
+        "size": "small",
+        "action": "mask_and_flow_channels",
+        "embodiment": "carried_render_and_shadows",
+        "visibility": "one_way",
+    },
     "train": {"batch": 16, "steps": 3000, "accumulate": 1},
     "mesh": {"data": -1, "fsdp": 1},
 }

@@ -16,14 +16,15 @@ from xew.analysis.studies.ledger import Ledger
 from xew.analysis.studies.machines import usable_gpus
 from xew.analysis.studies.plan import Step, count_gpus, count_sharing, generate_name, measured_bodies, sort_steps
 from xew.analysis.studies.rates import Rate, Source, find_rates
-from xew.config import merge_settings, read_yaml
+from xew.config import merge_settings, pick, read_yaml
 from xew.model.conditions import ACTIONS, CONDITIONS, list_conditions
 from xew.protocol import BASELINES, ROBOT_NAMES, Variant, training_counts
 
 OWN_TOKENS = ("action", "embodiment")
 """Streams of the network that have as many tokens as the video; other conditions are channels or few tokens."""
-PAIRS = 0.28
-"""Part of the FLOPs of `small` without such streams that grows with pairs of tokens, not with tokens."""
+PAIRS = 0.2
+"""Part of a sample's FLOPs that grows with pairs of tokens, not with tokens, where only the video has tokens: 0.28 of `small`,
+0.09 of `wan5b`."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +35,7 @@ class Cost:
     unit: str
     rate: Rate
     items: float
-    """Number of items that the rate counts: of a training run the samples of all batches, as if of the recommended recipe."""
+    """Number of items that the rate counts: of a training run the samples of all batches, as if of the study's experiment."""
     disk_mb: float = 0.0
 
     def seconds(self, gpus: int = 1) -> float:
@@ -42,15 +43,15 @@ class Cost:
         return self.rate.seconds(self.items, gpus)
 
 
-def find_size(study: Study) -> str:
-    """Key of the size of the study's network."""
-    settings = merge_settings(merge_settings(RECIPE, read_yaml(study.experiment)), study.settings)
-    return str(settings["model"]["size"])
+def read_model(study: Study) -> Settings:
+    """The model of the study's experiment, whose size its rates are of."""
+    model: Settings = merge_settings(merge_settings(RECIPE, read_yaml(study.experiment)), study.settings)["model"]
+    return model
 
 
 def study_rates(study: Study) -> Source:
     """The rates that a study is estimated by. Raises ConfigError for a file of rates that cannot be read."""
-    return find_rates(find_size(study), study.machine.rates)
+    return find_rates(str(read_model(study)["size"]), study.machine.rates)
 
 
 def estimate(study: Study, steps: Mapping[str, Step]) -> dict[str, Cost]:
@@ -69,7 +70,8 @@ def estimate(study: Study, steps: Mapping[str, Step]) -> dict[str, Cost]:
     for variant in study.planned_runs:
         experiment = build_experiment(study, variant)
         updates, graded = count_optimizer_steps(study, variant, experiment), sum(study.graded_counts(variant).values())
-        samples = updates * merge_settings(RECIPE, experiment)["train"]["batch"] * relative_work(variant)
+        complete = merge_settings(RECIPE, experiment)
+        samples = updates * complete["train"]["batch"] * work_of_sample(complete["model"]) / work_of_sample(read_model(study))
         add(f"latents/{variant.name}", _count_new_streams(study, variant, experiment, encoded), "streams")
         add(f"{'adapt' if variant.target else 'train'}/{variant.name}", updates, "steps", samples, stored=1)
         add(f"rollout/{variant.name}", graded, "episodes")
@@ -86,11 +88,12 @@ def estimate(study: Study, steps: Mapping[str, Step]) -> dict[str, Cost]:
     return {name: costs[name] for name in steps}
 
 
-def relative_work(variant: Variant) -> float:
-    """FLOPs of a training sample relative to those of the recommended recipe, whose conditions are channels."""
-    conditions = (*list_conditions(ACTIONS[variant.action]), *list_conditions(CONDITIONS[variant.embodiment]))
+def work_of_sample(model: Settings) -> float:
+    """FLOPs of a training sample relative to one whose conditions have no tokens of their own."""
+    action, embodiment = pick(ACTIONS, model["action"], "action", (tuple,)), pick(CONDITIONS, model["embodiment"], "embodiment")
+    conditions = (*list_conditions(action), *list_conditions(embodiment))
     own = sum(condition.stream in OWN_TOKENS for condition in conditions)
-    pairs = 1 + own + own**2  # the video sees all, conditions see only conditions
+    pairs = (1 + own) ** 2 if model["visibility"] == "joint" else 1 + own + own**2
     return (1 - PAIRS) * (1 + own) + PAIRS * pairs
 
 
