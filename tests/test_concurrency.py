@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures.process import BrokenProcessPool
 from multiprocessing.connection import Connection
 from pathlib import Path
 
@@ -17,11 +18,13 @@ import numpy as np
 import pytest
 
 from xew.concurrency import (
+    close_processes,
     free_gpu_memory,
     leave_with_parent,
     map_in_order,
     map_in_processes,
     map_with_shared_memory,
+    open_processes,
     queue_to,
 )
 from xew.episode import EpisodeError
@@ -287,3 +290,34 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
     small_pages = os.environ | {"NUMPY_MADVISE_HUGEPAGE": "0"}
     done = subprocess.run([sys.executable, "-c", program], env=small_pages, capture_output=True, text=True, check=True)
     assert int(done.stdout) < 100, "9,766 pages of 4 kB were cleared before"
+
+
+def test_a_pool_ends_that_breaks_while_it_starts_a_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A process is killed when another has begun and the pool does not know of it yet."""
+    pool = open_processes(2, (), os.getpid)
+    busy = pool.submit(time.sleep, 600)
+    processes, start, reader = pool._processes, pool._spawn_process, pool._call_queue._reader
+    ended, known, close = threading.Event(), threading.Event(), reader.close
+
+    def start_unknown() -> None:
+        (first,) = processes
+        start()
+        second = processes.pop(next(pid for pid in processes if pid != first))
+        os.kill(first, signal.SIGKILL)
+        assert ended.wait(30)
+        processes[second.pid] = second
+        known.set()
+
+    def close_after_ending() -> None:  # the pool calls it when it has ended the processes that it knows of
+        ended.set()
+        assert known.wait(30)
+        close()
+
+    monkeypatch.setattr(pool, "_spawn_process", start_unknown)
+    monkeypatch.setattr(reader, "close", close_after_ending)
+    waiting = pool.submit(time.sleep, 600)
+    ending = threading.Thread(target=close_processes, args=(pool,), daemon=True)
+    ending.start()
+    ending.join(30)
+    assert not ending.is_alive()
+    assert all(isinstance(call.exception(), BrokenProcessPool) for call in (busy, waiting))

@@ -150,6 +150,18 @@ def open_processes(
     )
 
 
+def close_processes(pool: ProcessPoolExecutor) -> None:
+    """End the processes of a pool, and wait until they have.
+
+    A pool that breaks while it starts a process waits for that one forever, because it ends only those that it knew of. So all
+    processes of a broken pool are ended here.
+    """
+    if pool._broken:
+        for process in list(pool._processes.values()):
+            process.terminate()
+    pool.shutdown(cancel_futures=True)
+
+
 def _begin_process(
     environment: dict[str, str], begin: Callable[..., object], arguments: tuple[Any, ...], turns: "SimpleQueue[Any] | None"
 ) -> None:
@@ -189,7 +201,7 @@ def map_in_processes(
     except BrokenProcessPool as error:
         raise EpisodeError(f"{KILLED}, and end other programs or use fewer processes if it happens again.") from error
     finally:
-        pool.shutdown(cancel_futures=True)
+        close_processes(pool)
 
 
 @contextmanager

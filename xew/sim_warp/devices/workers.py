@@ -14,7 +14,7 @@ from typing import TypeVar
 
 import warp
 
-from xew.concurrency import KILLED, open_processes, usable_cores
+from xew.concurrency import KILLED, close_processes, open_processes, usable_cores
 from xew.config import ConfigError
 from xew.episode import EpisodeError
 
@@ -107,7 +107,7 @@ class Workers:
         return self
 
     def __exit__(self, *error: object) -> None:
-        self._pool.shutdown(cancel_futures=True)
+        close_processes(self._pool)
 
     def start(self, function: Callable[[Job], Result], job: Job) -> Callable[[], Result]:
         """Begin one job; returns the function that waits for its result, and raises as `run`."""
