@@ -56,7 +56,7 @@ def study_rates(study: Study) -> Source:
 
 def estimate(study: Study, steps: Mapping[str, Step]) -> dict[str, Cost]:
     """The cost of every step from the study's rates, as if nothing were done."""
-    rates, costs = study_rates(study), dict[str, Cost]()
+    rates, costs, measured = study_rates(study), dict[str, Cost](), work_of_sample(read_model(study))
 
     def add(name: str, amount: int, unit: str, items: float | None = None, stored: int | None = None) -> None:
         """Note the cost of a step; `stored` is the number of products on disk, by default one an item."""
@@ -71,7 +71,7 @@ def estimate(study: Study, steps: Mapping[str, Step]) -> dict[str, Cost]:
         experiment = build_experiment(study, variant)
         updates, graded = count_optimizer_steps(study, variant, experiment), sum(study.graded_counts(variant).values())
         complete = merge_settings(RECIPE, experiment)
-        samples = updates * complete["train"]["batch"] * work_of_sample(complete["model"]) / work_of_sample(read_model(study))
+        samples = updates * complete["train"]["batch"] * work_of_sample(complete["model"]) / measured
         add(f"latents/{variant.name}", _count_new_streams(study, variant, experiment, encoded), "streams")
         add(f"{'adapt' if variant.target else 'train'}/{variant.name}", updates, "steps", samples, stored=1)
         add(f"rollout/{variant.name}", graded, "episodes")
