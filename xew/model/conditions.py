@@ -3,7 +3,7 @@
 Reads  a `Command`: robot, commanded joints, camera, the robot-only render of those commands, and the scene's first frame
 Writes uint8 [t h w 3] pictures for the codec, or float32 [t n] numbers
 To add one: a function of a Command and one line in ACTIONS or CONDITIONS; from outside the repo, `module:NAME` of a
-`Condition` or of a tuple of them.
+`Condition` or of a tuple of them. Entries in _channels join a picture to the video's channels; it has no tokens of its own.
 
 Tables and figures take titles and labels from here, so this file imports neither JAX nor Warp. The last entries of ACTIONS are
 other systems of the paper, as combinations of mechanisms (network/mechanisms.py) in the same network. A Command holds no
@@ -422,6 +422,14 @@ ACTIONS: dict[str, Condition | System] = {
     "ray_map": Condition("ray_map", "action", ray_map, title="Ray map", label="ray map"),
     "mask_channels": System(
         (Condition("mask", "mask_channels", robot_mask),), title="Mask as channels", label="mask as channels"
+    ),
+    "optical_flow_channels": System(
+        (Condition("optical_flow", "flow_channels", optical_flow),),
+        title="Optical flow as channels",
+        label="optical flow as channels",
+    ),
+    "ray_map_channels": System(
+        (Condition("ray_map", "map_channels", ray_map),), title="Ray map as channels", label="ray map as channels"
     ),
     "mask_and_flow_channels": System(
         (Condition("mask", "mask_channels", robot_mask), Condition("optical_flow", "flow_channels", optical_flow)),

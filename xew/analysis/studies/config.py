@@ -6,13 +6,13 @@ A study names one experiment (a config of xew.model) and the differences of all 
 
 import fnmatch
 import shlex
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 from xew.config import ConfigError, check_finite, load, merge_settings, read_yaml, suggestion
-from xew.model.conditions import CONDITIONS, list_conditions, shows_carried
+from xew.model.conditions import ACTIONS, CONDITIONS, list_conditions, shows_carried
 from xew.protocol import (
     HEAD,
     MOTIONS,
@@ -129,6 +129,8 @@ class Study:
     """Patterns: variants whose names match one of them are trained with every one of these seeds, others with the first."""
     settings: Settings = field(default_factory=dict)
     """Settings laid over the experiment for every variant."""
+    dense_channels: bool = False
+    """Whether mask, optical flow, ray map and per-frame render are channels of the video instead of tokens of their own."""
     adaptation: Settings = field(default_factory=dict)
     """Settings laid over it for adaptations."""
     remedies: dict[str, Settings] = field(
@@ -366,12 +368,18 @@ def build_experiment(study: Study, variant: Variant) -> Settings:
         "cache": str(study.folder_of("latents", variant.change)),
         "split": split_key(variant.split, study.motion),
         "model": {
-            "action": variant.action,
-            "embodiment": variant.embodiment,
+            "action": _place_condition(study, variant.action, ACTIONS),
+            "embodiment": _place_condition(study, variant.embodiment, CONDITIONS),
         },
     }
     given |= {"view": study.view} if study.view != settings.get("view", HEAD) else {}
     return merge_settings(settings, given)
+
+
+def _place_condition(study: Study, name: str, known: Mapping[str, Any]) -> str:
+    """The condition of this name, or the same picture as channels if the study asks for it and there is such an entry."""
+    joined = f"{name}_channels"
+    return joined if study.dense_channels and joined in known else name
 
 
 def run_folder(study: Study, variant: Variant) -> Path:
