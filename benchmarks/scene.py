@@ -22,7 +22,7 @@ from xew.protocol import expand_robots
 from xew.sim_warp import generate
 from xew.sim_warp.devices.workers import quiet_warp
 from xew.sim_warp.production.cells import Job
-from xew.sim_warp.production.produce import Production, simulate_jobs, write_scene
+from xew.sim_warp.production.produce import Production, simulate_jobs, write_cells
 from xew.sim_warp.rendering.render import Renderer
 from xew.sim_warp.robots import get_robot
 
@@ -45,7 +45,7 @@ def main(args: Args) -> None:
         production = Production(Path(folder), robots)
         with generate.start_workers(asked, robots) as (_, make):
             ways: dict[str, Callable[[], list[Record]]] = {
-                "one process": lambda: write_scene(simulate_jobs([job], production)[0], production.out, renderer),
+                "one process": lambda: write_cells(simulate_jobs([job], production)[0], production.out, renderer),
                 f"robot by robot, {args.workers} workers": lambda: next(iter(make([job])))[0],
             }
             seconds = time_by_turns(ways, args.repeats)

@@ -18,7 +18,7 @@ from xew.episode import Record
 from xew.sim_warp import objects
 from xew.sim_warp.plan import HOME, LEFT, RIGHT, Timeline
 from xew.sim_warp.production.cells import Job
-from xew.sim_warp.production.produce import Production, simulate_jobs, write_scene
+from xew.sim_warp.production.produce import Production, simulate_jobs, write_cells
 from xew.sim_warp.rendering.render import Renderer
 from xew.sim_warp.robots import ROBOTS, RobotSpec
 from xew.sim_warp.scene import Scene, SceneObject, upright
@@ -64,7 +64,7 @@ def produce(
     """Make some scenes in this process, with physics on the CPU; the headers of each job in the order of its robots."""
     production = Production(out, robots, videos=videos)
     scenes = zip(jobs, simulate_jobs(jobs, production), strict=True)
-    return [write_scene(cells, out, renderer, rejected=job.rejected, videos=videos) for job, cells in scenes]
+    return [write_cells(cells, out, renderer, rejected=job.rejected, videos=videos) for job, cells in scenes]
 
 
 class InlineWorkers:

@@ -17,7 +17,7 @@ from xew.sim_warp.production.produce import Production, make_scenes, simulate_jo
 
 ROBOTS = ("franka_panda", SLOW)
 PRODUCTION = Production(Path("nowhere"), WITH_SLOW)
-CELL = {"task_name": TASK, "seed": 0, "robot_name": "piper"}
+CELL = {"task_name": TASK, "seed": 0, "robot_name": "piper", "failure": None}
 
 
 def make(
@@ -60,6 +60,30 @@ def test_scenes_are_simulated_before_the_renderer_is_compiled(monkeypatch: pytes
     pool = cast(Any, InlineWorkers(1))
     list(make_scenes(pool, [Job(TASK, 0, ("piper",))], PRODUCTION, lambda: order.append("wait")))
     assert order == ["simulate", "wait", "write"]
+
+
+def test_a_scene_of_many_robots_is_written_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each worker holds the pictures of a few robots; what one robot fails is rejected in all parts."""
+    monkeypatch.setattr(produce, "ROBOTS_TOGETHER", 1)
+    made, done = make([Job(TASK, 0, ROBOTS), Job(TASK, 1, ROBOTS)], monkeypatch)
+    assert [step[1:] for step in done if step[0] == "write"] == [
+        (seed, (robot,), seed == 1) for seed in (0, 1) for robot in ROBOTS
+    ]
+    assert [[record.robot for record in records] for records, _ in made] == [list(ROBOTS)] * 2
+    assert [seconds for _, seconds in made] == [4, 4]
+
+
+def test_episodes_do_not_depend_on_the_parts_of_a_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    jobs = [Job(TASK, 0, ("piper", "franka_panda", "ur5_wsg"))]
+    for together in (1, 2, 8):
+        monkeypatch.setattr(produce, "ROBOTS_TOGETHER", together)
+        list(make_scenes(cast(Any, InlineWorkers(1)), jobs, Production(tmp_path / str(together))))
+    first, *others = (
+        {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+        for folder in sorted(tmp_path.iterdir())
+    )
+    assert len(first) > 9
+    assert others == [first, first]
 
 
 def test_what_a_robot_of_an_earlier_run_has_failed_stays_rejected(monkeypatch: pytest.MonkeyPatch) -> None:

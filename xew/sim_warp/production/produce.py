@@ -1,4 +1,4 @@
-"""Scenes made in worker processes: simulated in shares, then rendered and written one scene at a time.
+"""Scenes made in worker processes: simulated in shares, then rendered and written a few robots at a time.
 
 A scene is rendered only if all of its robots succeed: all of them are simulated first. A completed scene is written before
 further simulations begin. On a CPU a share is one robot of a few scenes, on a GPU a batch of whole scenes. While some workers
@@ -28,6 +28,8 @@ PLANNED_TOGETHER = 16
 """Largest number of scenes in a CPU's share. Inverse kinematics of 16 paths together takes a fifth of the time."""
 SHARES_PER_WORKER = 4
 """Least number of a CPU's shares for each worker, so all workers end at about the same time."""
+ROBOTS_TOGETHER = 8
+"""Largest number of a scene's robots whose pictures, 0.5 MB a frame each, one worker has in memory; other workers take more."""
 BATCHES_PER_GPU = 3
 """Number of batches in flight on a GPU: one is stepped while the models of the next ones are built."""
 
@@ -80,21 +82,33 @@ def _share_by_robot(jobs: Sequence[Job]) -> list[list[Job]]:
 
 @dataclass
 class _Scene:
-    """A job and its simulated cells."""
+    """A job, its simulated cells, and the headers of those that are written."""
 
     job: Job
     cells: list[Cell] = field(default_factory=list)
+    records: list[Record] = field(default_factory=list)
     seconds: float = 0.0
 
     @property
-    def ordered_cells(self) -> list[Cell]:
-        """The cells in the order of the job's robots."""
+    def rejected(self) -> bool:
+        """Whether a robot has failed, now or in an earlier run."""
+        return self.job.rejected or any(cell.failure for cell in self.cells)
+
+    @property
+    def groups(self) -> list[list[Cell]]:
+        """The cells in the order of the job's robots, as many as are written together."""
         by_robot = {cell.robot_name: cell for cell in self.cells}
-        return [by_robot[robot] for robot in self.job.robots]
+        cells = [by_robot[robot] for robot in self.job.robots]
+        return [cells[first : first + ROBOTS_TOGETHER] for first in range(0, len(cells), ROBOTS_TOGETHER)]
+
+    @property
+    def ordered_records(self) -> list[Record]:
+        """The headers in the order of the job's robots."""
+        return sorted(self.records, key=lambda record: self.job.robots.index(record.robot))
 
 
 Outcome = tuple[list[list[Cell]] | list[Record], float]
-"""Simulated cells of each job of a share, or the headers of a written scene; and the time for it [s]."""
+"""Simulated cells of each job of a share, or the headers of some written cells of a scene; and the time for it [s]."""
 
 
 def make_scenes(
@@ -111,8 +125,11 @@ def make_scenes(
     waiting = deque(shares[most:])
     for results, seconds in workers.run(operator.call, work):
         if results and isinstance(results[0], Record):
-            records = [record for record in results if isinstance(record, Record)]
-            yield records, scenes[records[0].task, records[0].seed].seconds + seconds
+            scene = scenes[results[0].task, results[0].seed]
+            scene.records += [record for record in results if isinstance(record, Record)]
+            scene.seconds += seconds
+            if len(scene.records) == len(scene.job.robots):
+                yield scene.ordered_records, scene.seconds
             continue
         if waiting:
             work.append(waiting.popleft())
@@ -123,7 +140,7 @@ def make_scenes(
             scene.seconds += seconds / len(cells)
             if len(scene.cells) == len(scene.job.robots):
                 wait_for_renderer()
-                work.appendleft(partial(_write, scene.ordered_cells, scene.job.rejected, production))
+                work.extendleft(partial(_write, group, scene.rejected, production) for group in reversed(scene.groups))
 
 
 def _simulate(share: Sequence[Job], production: Production) -> Outcome:
@@ -134,9 +151,9 @@ def _simulate(share: Sequence[Job], production: Production) -> Outcome:
 
 
 def _write(cells: Sequence[Cell], rejected: bool, production: Production) -> Outcome:
-    """Render and write a scene in a worker process, on its own device."""
+    """Render and write some cells of a scene in a worker process, on its own device."""
     begin = time.perf_counter()
-    records = write_scene(cells, production.out, _renderer(production.gpu_physics), rejected=rejected, videos=production.videos)
+    records = write_cells(cells, production.out, _renderer(production.gpu_physics), rejected=rejected, videos=production.videos)
     return records, time.perf_counter() - begin
 
 
@@ -153,10 +170,10 @@ def simulate_jobs(jobs: Sequence[Job], production: Production) -> list[list[Cell
     return simulate_cells(cells, production.physics, production.batch)
 
 
-def write_scene(
+def write_cells(
     cells: Sequence[Cell], out: Path, renderer: Renderer, *, rejected: bool = False, videos: bool = True
 ) -> list[Record]:
-    """Render and write the simulated cells of one scene; returns their headers in the same order.
+    """Render and write simulated cells of one scene; returns their headers in the same order.
 
     Nothing is rendered if a cell has failed, or if the scene is `rejected` by the failure of another robot.
     """
