@@ -24,7 +24,9 @@ DENSE = ("optical_flow", "mask", "ray_map", "robot_render")
 STUDIES = {
     "small": {"train.steps", "train.keep_checkpoints"},
     "paper": {"train.keep_checkpoints", "train.samples"},
+    "final": {"train.steps", "train.keep_checkpoints"},
     "bodies": {"train.steps", "train.keep_checkpoints"},
+    "halves": {"train.steps", "train.keep_checkpoints"},
     "debug": {
         *("clip.frames", "clip.height", "clip.width", "model.size", "train.steps", "train.batch", "train.save_every"),
         *("train.keep_checkpoints", "rollout.steps", "rollout.batch", "rollout.max_frames"),
