@@ -122,7 +122,7 @@ def test_the_final_study_makes_predicts_and_grades_seeds_that_nobody_has_looked_
     monkeypatch.setattr("xew.analysis.study.check_configs", lambda paths: None)
     trial = plan(replace(study, test_family="validation"))["generate"].command
     assert " ".join(trial).endswith("--train-seeds 1 --test-seeds 0 --validation-seeds 1")
-    for family, says in (("test", "from 1,000,000"), ("validation", "from 800,000"), ("final", "from 2,000,000")):
+    for family, says in (("test", "from 1,000,000"), ("validation", "from 800,000"), ("final", "from 2,100,000")):
         main(["configs/study_debug.yaml", "--dry-run", "--test-family", family, "--out", str(tmp_path / family)])
         assert says in capsys.readouterr().out
 
