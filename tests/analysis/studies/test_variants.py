@@ -22,11 +22,11 @@ CHOSEN = {"split", "model.action", "model.embodiment"}
 DENSE = ("optical_flow", "mask", "ray_map", "robot_render")
 """Conditions that are channels in every study but the paper's."""
 STUDIES = {
-    "small": {"train.steps", "train.keep_checkpoints"},
+    "small": {"train.steps", "train.keep_checkpoints", "train.samples"},
     "paper": {"train.keep_checkpoints", "train.samples"},
-    "final": {"train.steps", "train.keep_checkpoints"},
-    "bodies": {"train.steps", "train.keep_checkpoints"},
-    "halves": {"train.steps", "train.keep_checkpoints"},
+    "final": {"train.steps", "train.keep_checkpoints", "train.samples"},
+    "bodies": {"train.steps", "train.keep_checkpoints", "train.samples"},
+    "halves": {"train.steps", "train.keep_checkpoints", "train.samples"},
     "debug": {
         *("clip.frames", "clip.height", "clip.width", "model.size", "train.steps", "train.batch", "train.save_every"),
         *("train.keep_checkpoints", "rollout.steps", "rollout.batch", "rollout.max_frames"),

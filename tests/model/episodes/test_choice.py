@@ -55,6 +55,13 @@ def test_without_validation_seeds_samples_are_of_training_seeds_and_never_of_tes
     assert sample_episodes(dataset("test"), sample_roles(FIXED)) == {}
 
 
+def test_samples_of_a_split_of_many_bodies_show_a_few_of_each_role() -> None:
+    bodies = tuple(f"body_{i}" for i in range(12))
+    data = dataset("train", robots=(*bodies, "piper"))
+    found = sample_episodes(data, dict.fromkeys(bodies, "seen") | {"franka_panda": "unseen", "piper": "target"})
+    assert list(found) == [*(f"seen/body_{i}" for i in range(8)), "target/piper"]
+
+
 def test_nothing_is_trained_on_validation_or_test_seeds() -> None:
     episodes = training_episodes(dataset("train", "validation", "test"), EpisodeChoice(FIXED.train_robots))
     assert {seed_split(record.seed) for _, record in episodes} == {"train"}

@@ -10,6 +10,9 @@ from xew.episode import EpisodeError
 from xew.model.settings.parts import EpisodeChoice
 from xew.protocol import expand_robots
 
+SAMPLE_ROBOTS = 8
+"""Largest number of robots of a role in sample videos; a video takes seconds to grade, and there may be over a hundred bodies."""
+
 
 @dataclass(frozen=True)
 class TrainingEpisodes:
@@ -75,14 +78,20 @@ def first_of_each(episodes: Sequence[Episode], count: int) -> list[Episode]:
 
 
 def sample_episodes(dataset: Dataset, roles: Mapping[str, str], motion: str | None = None) -> dict[str, Episode]:
-    """The expert's episode with videos of each of these robots, by role and robot: of a validation, else a training seed."""
+    """The expert's episode with videos of these robots, by role and robot: of a validation, else a training seed.
+
+    Of each role, the first SAMPLE_ROBOTS robots that have one.
+    """
     candidates = [
         episode
         for family in ("validation", "train")
         for episode in dataset.select(robots=tuple(roles), split=family, motion=motion, faults=False)
     ]
     first = {record.robot: (folder, record) for folder, record in reversed(candidates) if record.videos}
-    return {f"{roles[robot]}/{robot}": first[robot] for robot in roles if robot in first}
+    by_role: dict[str, list[str]] = {}
+    for robot in filter(first.__contains__, roles):
+        by_role.setdefault(roles[robot], []).append(robot)
+    return {f"{role}/{robot}": first[robot] for role, robots in by_role.items() for robot in robots[:SAMPLE_ROBOTS]}
 
 
 def select_episodes(data: Path, split: str, robots: Sequence[str] | None = None, faults: bool = True) -> list[Episode]:
