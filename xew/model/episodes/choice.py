@@ -11,7 +11,7 @@ from xew.model.settings.parts import EpisodeChoice
 from xew.protocol import expand_robots
 
 SAMPLE_ROBOTS = 8
-"""Largest number of robots of a role in sample videos; a video takes seconds to grade, and there may be over a hundred bodies."""
+"""Largest number of robots of a role in sample videos, which take seconds each to grade; there may be 128 bodies."""
 
 
 @dataclass(frozen=True)
