@@ -73,6 +73,21 @@ def test_sample_videos_play_at_half_their_rate(rate: float, milliseconds: int, t
         assert (animation.n_frames, animation.info["duration"]) == (3, milliseconds)
 
 
+def test_sample_videos_keep_their_colors_in_all_frames(tmp_path: Path) -> None:
+    """A square on a ramp of grays turns from red to green after the first frame."""
+    video = np.broadcast_to(np.linspace(0, 255, 32).repeat(2)[:, None], (12, 48, 64, 3)).astype(np.uint8)
+    video[0, 8:24, 8:24], video[1:, 8:24, 8:24] = (200, 20, 20), (20, 200, 20)
+    written = RunLog(tmp_path, 0)
+    written.video(0, "sample", video, 25.0)
+    written.close()
+    accumulator = EventAccumulator(str(tmp_path))
+    accumulator.Reload()
+    with Image.open(io.BytesIO(accumulator.Images("sample")[0].encoded_image_string)) as animation:
+        for number, frame in enumerate(video):
+            animation.seek(number)
+            assert np.abs(np.asarray(animation.convert("RGB")).astype(int) - frame).max() <= 2
+
+
 def test_steps_that_were_lost_are_taken_back(tmp_path: Path) -> None:
     """Killed after step 30 with a checkpoint of step 20, in the middle of a line."""
     log(tmp_path, 0, {10: 4.0, 20: 3.0, 25: 8.0, 30: 9.0})

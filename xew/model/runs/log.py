@@ -60,15 +60,26 @@ class RunLog:
 
     def image(self, step: int, name: str, picture: np.ndarray) -> None:
         """Log a picture uint8 [h w 3]."""
-        self._add(step, [Summary.Value(tag=name, image=_encode_image([picture], "PNG"))])
+        self._picture(step, name, Image.fromarray(picture), format="PNG")
 
     def video(self, step: int, name: str, video: np.ndarray, frame_rate: float) -> None:
         """Log a video uint8 [t h w 3] of a frame rate [Hz] as an animated GIF among the images, at half speed."""
-        self._add(step, [Summary.Value(tag=name, image=_encode_image(list(video), "GIF", round(2000 / frame_rate)))])
+        # One palette for all frames: without one, Pillow finds the best colors of each frame, which takes 25 times as long.
+        palette = Image.fromarray(np.concatenate(list(video[::8, ::2, ::2]))).quantize()
+        first, *rest = (Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in video)
+        self._picture(
+            step, name, first, format="GIF", save_all=True, append_images=rest, duration=round(2000 / frame_rate), loop=0
+        )
 
     def close(self) -> None:
         self.lines.close()
         self.events.close()
+
+    def _picture(self, step: int, name: str, picture: Image.Image, **saving: Any) -> None:
+        buffer = io.BytesIO()
+        picture.save(buffer, **saving)
+        image = Summary.Image(height=picture.height, width=picture.width, colorspace=3, encoded_image_string=buffer.getvalue())
+        self._add(step, [Summary.Value(tag=name, image=image)])
 
     def _add(self, step: int, values: list[Summary.Value]) -> None:
         self.events.add_event(Event(wall_time=time.time(), step=step, summary=Summary(value=values)))
@@ -99,12 +110,3 @@ def _step_of(line: str) -> float:
     except (ValueError, KeyError, TypeError, RecursionError):
         return math.inf
     return step if isinstance(step, int) else math.inf
-
-
-def _encode_image(frames: list[np.ndarray], kind: str, frame_ms: int = 0) -> Summary.Image:
-    buffer = io.BytesIO()
-    pictures = [Image.fromarray(frame) for frame in frames]
-    animation = {"save_all": True, "append_images": pictures[1:], "duration": frame_ms, "loop": 0} if kind == "GIF" else {}
-    pictures[0].save(buffer, format=kind, **animation)
-    height, width = frames[0].shape[:2]
-    return Summary.Image(height=height, width=width, colorspace=3, encoded_image_string=buffer.getvalue())

@@ -6,12 +6,14 @@ Writes scores (validation/…), strips and videos to the run's log
 
 from collections import defaultdict
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
+from xew.concurrency import usable_cores
 from xew.dataset import Episode
 from xew.episode import Record
 from xew.model.cache.scales import Scale
@@ -108,13 +110,15 @@ class SampleRollouts:
         from xew.metrics.estimators.tracks import ReferenceTracker
         from xew.metrics.grade import Comparison, grade
 
+        def grade_one(name: str) -> dict[str, float]:
+            comparison = Comparison(videos[name], self.truths[name], estimate_masks, ReferenceTracker())
+            return grade(comparison, known_scores(self.episodes[name][1])).values
+
         values = defaultdict(list)
-        for name, video in videos.items():
-            role, truth = name.partition("/")[0], self.truths[name]
-            known = known_scores(self.episodes[name][1])
-            grades = grade(Comparison(video, truth, estimate_masks, ReferenceTracker()), known).values
-            for metric, value in grades.items():
-                values[f"validation/{metric}{suffix}/{role}"].append(value)
+        with ThreadPoolExecutor(usable_cores()) as pool:
+            for name, grades in zip(videos, pool.map(grade_one, videos), strict=True):
+                for metric, value in grades.items():
+                    values[f"validation/{metric}{suffix}/{name.partition('/')[0]}"].append(value)
         means = {name: float(np.nanmean(found)) for name, found in values.items() if not np.isnan(found).all()}
         return dict(sorted(means.items()))
 
