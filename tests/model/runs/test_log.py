@@ -74,9 +74,10 @@ def test_sample_videos_play_at_half_their_rate(rate: float, milliseconds: int, t
 
 
 def test_sample_videos_keep_their_colors_in_all_frames(tmp_path: Path) -> None:
-    """A square on a ramp of grays turns from red to green after the first frame."""
+    """A square moves over a ramp of grays, and turns from red to green after the first frame."""
     video = np.broadcast_to(np.linspace(0, 255, 32).repeat(2)[:, None], (12, 48, 64, 3)).astype(np.uint8)
-    video[0, 8:24, 8:24], video[1:, 8:24, 8:24] = (200, 20, 20), (20, 200, 20)
+    for number, frame in enumerate(video):
+        frame[8:24, 2 * number : 2 * number + 16] = (20, 200, 20) if number else (200, 20, 20)
     written = RunLog(tmp_path, 0)
     written.video(0, "sample", video, 25.0)
     written.close()
