@@ -14,12 +14,15 @@ from xew.analysis.beyond import (
     body_gaps,
     correlate_bodies,
     difficulty_table,
+    errors_table,
     find_difficulty,
     find_gaps,
     gaps_table,
+    halves_table,
     motion_table,
     scaling_frame,
     scaling_table,
+    unseen_errors,
 )
 from xew.analysis.beyond.difficulty import LEAST_BODIES
 from xew.analysis.beyond.scaling import ALONE, GROUPS, PASTED, WITH_ROBOTS
@@ -259,6 +262,30 @@ def test_the_gap_of_a_body_is_what_never_having_seen_it_costs(halves: Path) -> N
     assert (body_gaps(grades, distances_between_halves(), "psnr")["value"] > 0).all(), "positive is worse whatever the metric"
 
 
+def test_the_error_of_an_unseen_body_goes_with_how_hard_it_is(halves: Path) -> None:
+    grades = grades_of(halves)
+    found = find_gaps(grades, distances_between_halves())
+    errors = unseen_errors(found["lpips"], higher_is_better=False)
+    assert errors.correlations["appearance"].r > 0.6, "by the fixture, bodies are hard by their looks"
+    assert errors.correlations["kinematic"].r < found["lpips"].correlations["kinematic"].r - 0.1
+    psnr = unseen_errors(found["psnr"], higher_is_better=True)
+    assert psnr.correlations["appearance"].r > 0.6 and psnr.correlations["appearance"].frozen > 0.9, "positive is worse"
+    assert errors.values["value"].mean() == pytest.approx(
+        np.mean([grades.variant_mean(half.name, half.held_out_robots, "lpips").value for half in PARTS["halves"]])
+    )
+
+
+def test_scores_of_halves_are_those_of_the_model_that_saw_them_and_of_the_other(halves: Path) -> None:
+    grades = grades_of(halves)
+    table = halves_table(Builder(grades, PaperGrades(read_paper(), [])))
+    for section, seen, unseen in zip(table.sections, PARTS["halves"], PARTS["halves"][::-1], strict=True):
+        bodies = SPLITS[seen.split].train_robots
+        assert [row.labels[0] for row in section.rows] == ["trained on them", "never saw them", "frozen first frame"]
+        for row, model in zip(section.rows, (seen.name, unseen.name, "copy_first_frame"), strict=True):
+            assert row.cells[-1].value == grades.variant_mean(model, bodies, "lpips").value
+            assert row.cells[-1].episodes == 64 * len(SCENES)
+
+
 def test_one_half_alone_gives_no_gap(halves: Path) -> None:
     rows = pd.read_parquet(halves)
     alone = rows[rows["variant"] != PARTS["halves"][1].name]
@@ -266,6 +293,7 @@ def test_one_half_alone_gives_no_gap(halves: Path) -> None:
     grades = StudyGrades(alone, infos, paper_axes(read_paper()))
     found = find_gaps(grades, distances_between_halves())
     assert not len(found["lpips"].values) and gaps_table(found, grades.metrics) is None
+    assert errors_table(found, grades.metrics) is None
 
 
 def test_the_report_shows_the_gap_of_bodies(halves: Path, tmp_path: Path) -> None:
@@ -277,7 +305,9 @@ def test_the_report_shows_the_gap_of_bodies(halves: Path, tmp_path: Path) -> Non
     assert "## Distance and the gap of unseen bodies" in text
     assert "The gap of 128 bodies against their distance" in text
     assert "Over 128 bodies, LPIPS is 35\u00a0% higher on average for a model that never saw the body than for one" in text
-    assert "This gap correlates with kinematic distance at r = +0.9" in text
+    assert "This gap correlates with kinematic distance at r = +0.9" in text and "p < 0.001) and with appearance" in text
+    assert "LPIPS itself, of the model that never saw the body, correlates with kinematic distance at r = +0." in text
+    assert "| never saw them | " in text
     assert ": the gap goes with kinematics, not looks." in text
     assert (tmp_path / "report" / "figures" / "halves.png").stat().st_size > 1000
 

@@ -6,7 +6,7 @@ distance. `halves.py`: gap between models that saw a body and that did not. `mot
 """
 
 from xew.analysis.beyond.difficulty import OverBodies, body_errors, correlate_bodies, difficulty_table, find_difficulty
-from xew.analysis.beyond.halves import body_gaps, find_gaps, gaps_table
+from xew.analysis.beyond.halves import body_gaps, errors_table, find_gaps, gaps_table, halves_table, unseen_errors
 from xew.analysis.beyond.motion import Motions, motion_frame, motion_table
 from xew.analysis.beyond.scaling import scaling_frame, scaling_table
 from xew.analysis.beyond.shifts import Shifts, shifts_frame, shifts_table
@@ -19,13 +19,16 @@ __all__ = [
     "body_gaps",
     "correlate_bodies",
     "difficulty_table",
+    "errors_table",
     "find_difficulty",
     "find_gaps",
     "gaps_table",
+    "halves_table",
     "motion_frame",
     "motion_table",
     "scaling_frame",
     "scaling_table",
     "shifts_frame",
     "shifts_table",
+    "unseen_errors",
 ]

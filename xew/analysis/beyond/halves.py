@@ -11,12 +11,15 @@ import pandas as pd
 from xew.analysis.beyond.difficulty import OverBodies, bodies_table, correlate_bodies, mean_distances
 from xew.analysis.scores import COPY, MetricInfo
 from xew.analysis.statistics.grades import StudyGrades, relative_loss
+from xew.analysis.tables.builder import Builder
 from xew.analysis.tables.distances import Distances
 from xew.analysis.tables.labels import PAPER_METRICS
-from xew.analysis.tables.table import Table
+from xew.analysis.tables.table import Table, TableRow, TableSection, metric_columns
 from xew.protocol import PARTS, SPLITS
 
 PART = "halves"
+TITLES = ("Even bodies", "Odd bodies")
+"""Titles of the training bodies of the two models."""
 
 
 def find_gaps(grades: StudyGrades, distances: Distances) -> dict[str, OverBodies]:
@@ -36,8 +39,8 @@ def body_gaps(grades: StudyGrades, distances: Distances, metric: str) -> pd.Data
     halves the same mean removes this effect.
 
     Returns:
-        Table by body: value (gap in percent, positive is worse), frozen (error of the frozen first frame), and mean distances
-            to the bodies in training.
+        Table by body: value (gap in percent, positive is worse), unseen (score of the model that never saw the body), frozen
+            (error of the frozen first frame), and mean distances to the bodies in training.
     """
     info = grades.metrics[metric]
     found = []
@@ -50,11 +53,39 @@ def body_gaps(grades: StudyGrades, distances: Distances, metric: str) -> pd.Data
             if after is not None and before is not None:
                 gap = 100 * relative_loss(after, before, info).value
                 sign = -1 if info.higher_is_better else 1
-                rows[body] = {"value": gap, "frozen": sign * frozen.value if frozen else np.nan}
-        found.append(pd.DataFrame.from_dict(rows, orient="index", columns=["value", "frozen"]).join(by_axis, how="inner"))
-    halves = [half for half in found if len(half)] or found
-    level = np.mean([half["value"].mean() for half in halves])
-    return pd.concat([half.assign(value=half["value"] - half["value"].mean() + level) for half in halves]).rename_axis("body")
+                rows[body] = {"value": gap, "unseen": after.value, "frozen": sign * frozen.value if frozen else np.nan}
+        columns = ["value", "unseen", "frozen"]
+        found.append(pd.DataFrame.from_dict(rows, orient="index", columns=columns).join(by_axis, how="inner"))
+    halves, leveled = [half for half in found if len(half)] or found, ["value", "unseen"]
+    level = np.mean([half[leveled].mean() for half in halves], axis=0)
+    return pd.concat([half.assign(**(half[leveled] - half[leveled].mean() + level)) for half in halves]).rename_axis("body")
+
+
+def unseen_errors(gaps: OverBodies, higher_is_better: bool) -> OverBodies:
+    """The score on each body of the model that never saw it, with its correlations, instead of the gap."""
+    values = gaps.values.assign(value=gaps.values["unseen"], frozen=(-1 if higher_is_better else 1) * gaps.values["frozen"])
+    return OverBodies(values, correlate_bodies(values, higher_is_better))
+
+
+def halves_table(builder: Builder) -> Table:
+    """Mean scores on each half of the bodies, of the model that trained on it and of the one that did not."""
+    metrics, sections = builder.reported, []
+    for title, seen, unseen in zip(TITLES, PARTS[PART], PARTS[PART][::-1], strict=True):
+        bodies = SPLITS[seen.split].train_robots
+        models = {"trained on them": seen, "never saw them": unseen}
+        rows = [
+            TableRow((label,), tuple(builder.variant_cell(model.name, bodies, metric) for metric in metrics))
+            for label, model in models.items()
+        ]
+        sections.append(TableSection(title, (*rows, *builder.baselines(bodies, metrics))))
+    return Table(
+        "halves_scores",
+        "Bodies in training and not",
+        "Two models, each trained on one half of the bodies and graded on both.",
+        ("model",),
+        metric_columns(builder.ours.metrics, metrics),
+        tuple(sections),
+    )
 
 
 def gaps_table(found: Mapping[str, OverBodies], metrics: Mapping[str, MetricInfo]) -> Table | None:
@@ -68,4 +99,16 @@ def gaps_table(found: Mapping[str, OverBodies], metrics: Mapping[str, MetricInfo
         "score. Both halves have the same mean gap, which removes a general difference of the two models. Pearson's r of the "
         "gap with the body's mean distance to the first model's training bodies, with its 95 % interval over bodies. Positive: "
         "farther bodies have a larger gap.",
+    )
+
+
+def errors_table(found: Mapping[str, OverBodies], metrics: Mapping[str, MetricInfo]) -> Table | None:
+    """Correlation of each score itself, of the model that never saw a body, with distance; None if there are too few bodies."""
+    return bodies_table(
+        {name: unseen_errors(gaps, metrics[name].higher_is_better) for name, gaps in found.items()},
+        metrics,
+        "halves_errors",
+        "Error on {} bodies of the model that never saw them, against their distance",
+        "Pearson's r of the model's score on a body with the body's mean distance to the model's training bodies, with its "
+        "95 % interval over bodies. Both halves have the same mean score. Positive: farther is worse.",
     )

@@ -13,7 +13,7 @@ from xew.analysis.tables.builder import Builder
 from xew.analysis.tables.distances import certainty_table, correlation_table, distance_tables, printed_distances
 from xew.analysis.tables.findings import FAILS, HOLDS, UNMEASURED, UNRESOLVED, Finding, ask
 from xew.analysis.tables.layouts import build_tables, count_table
-from xew.analysis.tables.table import TableCell, format_signed
+from xew.analysis.tables.table import TableCell, format_p, format_signed
 
 TITLE = "The paper's figures, rebuilt from one another"
 PRIMARY = "lpips"
@@ -68,7 +68,7 @@ def describe_correlations(paper: Paper) -> list[str]:
 
 def _correlation_sentence(axis: str, result: Correlation) -> str:
     return (
-        f"{PAPER_TITLES[PRIMARY]} against {axis} distance: r = {format_signed(result.r)}, p = {result.p_value:.3f}; its sign "
+        f"{PAPER_TITLES[PRIMARY]} against {axis} distance: r = {format_signed(result.r)}, {format_p(result.p_value)}; its sign "
         f"{describe_stability(result)}."
     )
 

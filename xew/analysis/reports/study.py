@@ -11,9 +11,11 @@ from xew.analysis.beyond import (
     Motions,
     Shifts,
     difficulty_table,
+    errors_table,
     find_difficulty,
     find_gaps,
     gaps_table,
+    halves_table,
     motion_table,
     scaling_table,
     shifts_table,
@@ -77,7 +79,7 @@ SECTIONS: Mapping[str, tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]]
     "baselines": ((), ("baselines",), ()),
     "scaling": (("scaling",), ("scaling",), ()),
     "bodies": (("bodies",), ("bodies",), ()),
-    "halves": (("halves",), ("halves",), ()),
+    "halves": (("halves",), ("halves_scores", "halves", "halves_errors"), ()),
     "motion": (("motion",), ("motion",), ()),
     "shifts": (("shifts",), ("shifts",), ()),
     "outside": ((), ("outside",), ()),
@@ -172,7 +174,8 @@ def build(
     builder = Builder(grades, printed, {name: counts["expected"] for name, counts in planned.items()})
     note, difficulty, gaps = trainings_note(grades), find_difficulty(grades, known), find_gaps(grades, known)
     tables = _make_tables(builder, scores, known, (note, grades.notes))
-    tables += filter(None, (difficulty_table(difficulty, grades.metrics), gaps_table(gaps, grades.metrics)))
+    over_bodies = ((difficulty_table, difficulty), (gaps_table, gaps), (errors_table, gaps))
+    tables += filter(None, (make(found, grades.metrics) for make, found in over_bodies))
     motions = Motions(scores, others.motion) if others.motion else None
     shifts = Shifts(scores, others.shifted) if others.shifted else None
     shifts = shifts if shifts and shifts.models else None
@@ -212,6 +215,8 @@ def _make_tables(builder: Builder, scores: Scores, known: Distances, notes: Sequ
     scored = [*build_tables(builder), *outside_tables(builder, scores.rows)]
     if builder.has_results("scaling"):
         scored.append(scaling_table(builder))
+    if builder.has_results("halves"):
+        scored.append(halves_table(builder))
     captions = [(table.caption, parting_note(table.sections), *notes) for table in scored]
     tables = [replace(t, caption=" ".join(filter(None, texts))) for t, texts in zip(scored, captions, strict=True)]
     tables += [count_table(builder), *distance_tables(known)]

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 import pandas as pd
 
-from xew.analysis.beyond import Motions, OverBodies, Shifts
+from xew.analysis.beyond import Motions, OverBodies, Shifts, unseen_errors
 from xew.analysis.beyond.shifts import MODELS
 from xew.analysis.paper import AXES
 from xew.analysis.scores import Scores, describe_scores
@@ -15,7 +15,7 @@ from xew.analysis.tables.comparisons import OTHER_ROBOTS, NotMeasuredError, Read
 from xew.analysis.tables.distances import Distances, correlate
 from xew.analysis.tables.findings import BEATS, FAILS, HOLDS, UNMEASURED, UNRESOLVED, Finding
 from xew.analysis.tables.labels import ACTIONS, LADDER, REMEDIES, ROBOT_TITLES, SHORT_ROBOTS
-from xew.analysis.tables.table import format_change, format_signed
+from xew.analysis.tables.table import format_change, format_p, format_signed
 from xew.protocol import BODY_SCALES, FORGETTING_ROBOT, HELD_OUT_ROBOTS, PAPER_PARTS, PARTS
 from xew.statistics import ASSUMED_SPREAD, LEVEL, Mean, interval_of_difference, strict_metrics
 
@@ -178,7 +178,7 @@ def _distance_sentences(grades: Grades, distances: Distances) -> Iterator[str]:
         if result := results.get(("lpips", axis)):
             yield (
                 f"Over the five leave-one-out folds, LPIPS correlates with {axis} distance at r = {format_signed(result.r)} "
-                f"(p = {result.p_value:.3f}); its sign is {'stable' if result.stable else 'unstable'}."
+                f"({format_p(result.p_value)}); its sign is {'stable' if result.stable else 'unstable'}."
             )
 
 
@@ -214,6 +214,8 @@ def _halves_sentence(gaps: OverBodies | None) -> Iterator[str]:
             f"This gap correlates {' and '.join(parts)}."
         )
         yield from _looks_or_kinematics(gaps)
+        errors = _correlations(unseen_errors(gaps, higher_is_better=False))
+        yield f"LPIPS itself, of the model that never saw the body, correlates {' and '.join(errors)}."
 
 
 def _looks_or_kinematics(gaps: OverBodies) -> Iterator[str]:
@@ -267,7 +269,7 @@ def _list_changes(changes: Sequence[str]) -> str:
 def _correlations(difficulty: OverBodies) -> list[str]:
     return [
         f"with {axis} distance at r = {format_signed(result.r)} ({format_signed(result.low)} to {format_signed(result.high)}, "
-        f"p = {result.p_value:.3f})"
+        f"{format_p(result.p_value)})"
         for axis, result in difficulty.correlations.items()
         if axis in AXES
     ]

@@ -102,6 +102,11 @@ def format_signed(value: float) -> str:
     return f"{value:+z.3f}".replace("-", "−")
 
 
+def format_p(p_value: float) -> str:
+    """Text such as 'p = 0.031' or 'p < 0.001'."""
+    return f"p = {p_value:.3f}" if p_value >= 0.001 else "p < 0.001"
+
+
 def format_share(value: float) -> str:
     """Text such as '8.5 %' or '31 %'."""
     digits = 1 if abs(value) < 0.0995 else 0
