@@ -17,12 +17,12 @@ from xew.analysis.beyond import (
     errors_table,
     find_difficulty,
     find_gaps,
+    find_unseen_errors,
     gaps_table,
     halves_table,
     motion_table,
     scaling_frame,
     scaling_table,
-    unseen_errors,
 )
 from xew.analysis.beyond.difficulty import LEAST_BODIES
 from xew.analysis.beyond.scaling import ALONE, GROUPS, PASTED, WITH_ROBOTS
@@ -265,10 +265,9 @@ def test_the_gap_of_a_body_is_what_never_having_seen_it_costs(halves: Path) -> N
 def test_the_error_of_an_unseen_body_goes_with_how_hard_it_is(halves: Path) -> None:
     grades = grades_of(halves)
     found = find_gaps(grades, distances_between_halves())
-    errors = unseen_errors(found["lpips"], higher_is_better=False)
+    errors, psnr = (find_unseen_errors(found)[name] for name in ("lpips", "psnr"))
     assert errors.correlations["appearance"].r > 0.6, "by the fixture, bodies are hard by their looks"
     assert errors.correlations["kinematic"].r < found["lpips"].correlations["kinematic"].r - 0.1
-    psnr = unseen_errors(found["psnr"], higher_is_better=True)
     assert psnr.correlations["appearance"].r > 0.6 and psnr.correlations["appearance"].frozen > 0.9, "positive is worse"
     assert errors.values["value"].mean() == pytest.approx(
         np.mean([grades.variant_mean(half.name, half.held_out_robots, "lpips").value for half in PARTS["halves"]])
@@ -293,7 +292,7 @@ def test_one_half_alone_gives_no_gap(halves: Path) -> None:
     grades = StudyGrades(alone, infos, paper_axes(read_paper()))
     found = find_gaps(grades, distances_between_halves())
     assert not len(found["lpips"].values) and gaps_table(found, grades.metrics) is None
-    assert errors_table(found, grades.metrics) is None
+    assert errors_table(find_unseen_errors(found), grades.metrics) is None
 
 
 def test_the_report_shows_the_gap_of_bodies(halves: Path, tmp_path: Path) -> None:

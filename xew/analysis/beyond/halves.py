@@ -39,8 +39,8 @@ def body_gaps(grades: StudyGrades, distances: Distances, metric: str) -> pd.Data
     halves the same mean removes this effect.
 
     Returns:
-        Table by body: value (gap in percent, positive is worse), unseen (score of the model that never saw the body), frozen
-            (error of the frozen first frame), and mean distances to the bodies in training.
+        Table by body: value (gap in percent), unseen and frozen (errors of the model that never saw the body and of the frozen
+            first frame; all three are worse if larger), and mean distances to the bodies in training.
     """
     info = grades.metrics[metric]
     found = []
@@ -53,18 +53,20 @@ def body_gaps(grades: StudyGrades, distances: Distances, metric: str) -> pd.Data
             if after is not None and before is not None:
                 gap = 100 * relative_loss(after, before, info).value
                 sign = -1 if info.higher_is_better else 1
-                rows[body] = {"value": gap, "unseen": after.value, "frozen": sign * frozen.value if frozen else np.nan}
+                rows[body] = {"value": gap, "unseen": sign * after.value, "frozen": sign * frozen.value if frozen else np.nan}
         columns = ["value", "unseen", "frozen"]
         found.append(pd.DataFrame.from_dict(rows, orient="index", columns=columns).join(by_axis, how="inner"))
     halves, leveled = [half for half in found if len(half)] or found, ["value", "unseen"]
     level = np.mean([half[leveled].mean() for half in halves], axis=0)
-    return pd.concat([half.assign(**(half[leveled] - half[leveled].mean() + level)) for half in halves]).rename_axis("body")
+    for half in halves:
+        half[leveled] += level - half[leveled].mean()
+    return pd.concat(halves).rename_axis("body")
 
 
-def unseen_errors(gaps: OverBodies, higher_is_better: bool) -> OverBodies:
-    """The score on each body of the model that never saw it, with its correlations, instead of the gap."""
-    values = gaps.values.assign(value=gaps.values["unseen"], frozen=(-1 if higher_is_better else 1) * gaps.values["frozen"])
-    return OverBodies(values, correlate_bodies(values, higher_is_better))
+def find_unseen_errors(gaps: Mapping[str, OverBodies]) -> dict[str, OverBodies]:
+    """As `find_gaps`, with the error of the model that never saw a body instead of the gap."""
+    errors = {name: one.values.assign(value=one.values["unseen"]) for name, one in gaps.items()}
+    return {name: OverBodies(values, correlate_bodies(values, higher_is_better=False)) for name, values in errors.items()}
 
 
 def halves_table(builder: Builder) -> Table:
@@ -103,12 +105,12 @@ def gaps_table(found: Mapping[str, OverBodies], metrics: Mapping[str, MetricInfo
 
 
 def errors_table(found: Mapping[str, OverBodies], metrics: Mapping[str, MetricInfo]) -> Table | None:
-    """Correlation of each score itself, of the model that never saw a body, with distance; None if there are too few bodies."""
+    """Correlation of the error of the model that never saw a body with distance; None if there are too few bodies."""
     return bodies_table(
-        {name: unseen_errors(gaps, metrics[name].higher_is_better) for name, gaps in found.items()},
+        found,
         metrics,
         "halves_errors",
         "Error on {} bodies of the model that never saw them, against their distance",
-        "Pearson's r of the model's score on a body with the body's mean distance to the model's training bodies, with its "
-        "95 % interval over bodies. Both halves have the same mean score. Positive: farther is worse.",
+        "Pearson's r of the model's error on a body with the body's mean distance to the model's training bodies, with its "
+        "95 % interval over bodies. Both halves have the same mean error. Positive: farther is worse.",
     )

@@ -14,6 +14,7 @@ from xew.analysis.beyond import (
     errors_table,
     find_difficulty,
     find_gaps,
+    find_unseen_errors,
     gaps_table,
     halves_table,
     motion_table,
@@ -174,7 +175,7 @@ def build(
     builder = Builder(grades, printed, {name: counts["expected"] for name, counts in planned.items()})
     note, difficulty, gaps = trainings_note(grades), find_difficulty(grades, known), find_gaps(grades, known)
     tables = _make_tables(builder, scores, known, (note, grades.notes))
-    over_bodies = ((difficulty_table, difficulty), (gaps_table, gaps), (errors_table, gaps))
+    over_bodies = ((difficulty_table, difficulty), (gaps_table, gaps), (errors_table, find_unseen_errors(gaps)))
     tables += filter(None, (make(found, grades.metrics) for make, found in over_bodies))
     motions = Motions(scores, others.motion) if others.motion else None
     shifts = Shifts(scores, others.shifted) if others.shifted else None
@@ -189,7 +190,9 @@ def build(
     content = Content(
         TITLE,
         answer([contest for *_, contest in contests], answer_strip(shown, scores.frame_zero)),
-        study_sentences(grades, known, (difficulty.get("lpips"), gaps.get("lpips")), motions, shifts, findings, by_paper),
+        study_sentences(
+            grades, known, tuple(found.get("lpips") for _, found in over_bodies), motions, shifts, findings, by_paper
+        ),
         {HERE: findings, BY_PAPER: by_paper, PRINTED: by_print} if of_paper else {},
         CLAIMS_TEXT,
         {table.name: table for table in tables},

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 import pandas as pd
 
-from xew.analysis.beyond import Motions, OverBodies, Shifts, unseen_errors
+from xew.analysis.beyond import Motions, OverBodies, Shifts
 from xew.analysis.beyond.shifts import MODELS
 from xew.analysis.paper import AXES
 from xew.analysis.scores import Scores, describe_scores
@@ -41,14 +41,17 @@ def trainings_note(grades: StudyGrades) -> str:
 def study_sentences(
     grades: StudyGrades,
     distances: Distances,
-    over_bodies: tuple[OverBodies | None, OverBodies | None],
+    over_bodies: Sequence[OverBodies | None],
     motions: Motions | None,
     shifts: Shifts | None,
     findings: Sequence[Finding],
     by_paper: Sequence[Finding],
 ) -> list[str]:
-    """The results in sentences, one for each question that was asked; `over_bodies` are errors and gaps in LPIPS."""
-    errors, gaps = over_bodies
+    """The results in sentences, one for each question that was asked.
+
+    `over_bodies` are in LPIPS: errors of one model, gaps of halves, and errors of their models on bodies that they never saw.
+    """
+    errors, gaps, unseen = over_bodies
     return [
         *([_answer_sentence(findings)] if findings else []),
         *pasting_sentence(findings),
@@ -59,7 +62,7 @@ def study_sentences(
         *_distance_sentences(grades, distances),
         *_scaling_sentence(grades),
         *_bodies_sentence(errors),
-        *_halves_sentence(gaps),
+        *_halves_sentence(gaps, unseen),
         *_motion_sentences(motions),
         *_shifts_sentences(shifts),
     ]
@@ -204,7 +207,7 @@ def _bodies_sentence(difficulty: OverBodies | None) -> Iterator[str]:
         yield f"On {len(errors)} bodies that one model has never seen, its LPIPS correlates {' and '.join(parts)}.{last}"
 
 
-def _halves_sentence(gaps: OverBodies | None) -> Iterator[str]:
+def _halves_sentence(gaps: OverBodies | None, unseen: OverBodies | None) -> Iterator[str]:
     parts = _correlations(gaps) if gaps else []
     if gaps and parts:
         shares = gaps.values["value"] / 100
@@ -214,7 +217,7 @@ def _halves_sentence(gaps: OverBodies | None) -> Iterator[str]:
             f"This gap correlates {' and '.join(parts)}."
         )
         yield from _looks_or_kinematics(gaps)
-        errors = _correlations(unseen_errors(gaps, higher_is_better=False))
+    if errors := _correlations(unseen) if unseen else []:
         yield f"LPIPS itself, of the model that never saw the body, correlates {' and '.join(errors)}."
 
 

@@ -89,8 +89,9 @@ def sample_episodes(dataset: Dataset, roles: Mapping[str, str], motion: str | No
     ]
     first = {record.robot: (folder, record) for folder, record in reversed(candidates) if record.videos}
     by_role: dict[str, list[str]] = {}
-    for robot in filter(first.__contains__, roles):
-        by_role.setdefault(roles[robot], []).append(robot)
+    for robot, role in roles.items():
+        if robot in first:
+            by_role.setdefault(role, []).append(robot)
     return {f"{role}/{robot}": first[robot] for role, robots in by_role.items() for robot in robots[:SAMPLE_ROBOTS]}
 
 
